@@ -1,0 +1,1 @@
+"""Minimal solvers, one per file."""

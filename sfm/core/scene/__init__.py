@@ -1,0 +1,18 @@
+"""The products that stages hand on."""
+
+from sfm.core.scene.features import Features, Matches
+from sfm.core.scene.pairs import PairKind, TwoViewGeometry, ViewGraph
+from sfm.core.scene.reconstruction import Reconstruction, Tracks
+from sfm.core.scene.rigs import Frame, Rig
+
+__all__ = [
+    "Features",
+    "Frame",
+    "Matches",
+    "PairKind",
+    "Reconstruction",
+    "Rig",
+    "Tracks",
+    "TwoViewGeometry",
+    "ViewGraph",
+]

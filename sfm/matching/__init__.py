@@ -1,0 +1,6 @@
+"""Features of two images in, putative matches out."""
+
+from sfm.matching.nearest import MatchingConfig, match_features
+from sfm.matching.pairs import exhaustive_pairs
+
+__all__ = ["MatchingConfig", "exhaustive_pairs", "match_features"]
