@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Float64
 
 from sfm.core.arrays import Mask, Matrix3, Points2D, Points3D, Rays, Value, Vector, readonly
 from sfm.core.cameras import _kernels
 from sfm.core.cameras.models import CameraModel, model_by_name
+
+_ByPoint: TypeAlias = Float64[np.ndarray, "N 2 3"]
+_ByParams: TypeAlias = Float64[np.ndarray, "N 2 K"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -64,23 +70,78 @@ class Camera(Value):
         (fx, fy), (cx, cy) = self.focal_lengths, self.principal_point
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
+    @property
+    def max_angle(self) -> float:
+        """The angle from the optical axis, in radians, up to which rays and pixels correspond one to one.
+
+        It is where the radial part of the distortion stops increasing; tangential and thin-prism terms, which are
+        small, are judged point by point in `project`. A perspective model ends at π/2 at the latest, the others at π.
+        """
+        limit = float(_kernels.distortion_limit(self.model_info.model_id, self.params))
+        if not self.model_info.is_fisheye:
+            return math.atan(limit)
+        return _eucm_max_angle(*self.params[4:]) if self.model == "EUCM" else min(limit, math.pi)
+
+    @property
+    def max_radius(self) -> float:
+        """`max_angle` as the model measures it: tan θ for perspective models (inf without a limit), else θ."""
+        if self.model_info.is_fisheye:
+            return self.max_angle
+        return float(_kernels.distortion_limit(self.model_info.model_id, self.params))
+
+    def with_params(self, params: Vector) -> Camera:
+        """The same camera with other parameters.
+
+        Raises:
+            ValueError: the number of parameters is not the model's.
+        """
+        return dataclasses.replace(self, params=params)
+
+    def scaled(self, width: int, height: int) -> Camera:
+        """The camera of the same image resampled to `width` × `height`; distortion is independent of the size.
+
+        A model with one focal length scales it by the mean of both ratios, hence exactly only if the aspect is kept.
+
+        Raises:
+            ValueError: the size is not positive.
+        """
+        if width < 1 or height < 1:
+            raise ValueError(f"expected a positive image size, got {width} x {height}")
+        across, down = width / self.width, height / self.height
+        ratio = {"f": (across + down) / 2, "fx": across, "cx": across, "w": across, "fy": down, "cy": down, "h": down}
+        ratios = [ratio.get(name, 1.0) for name in self.model_info.param_names]
+        return dataclasses.replace(self, width=width, height=height, params=self.params * np.array(ratios))
+
     def project(self, points3D: Points3D) -> tuple[Points2D, Mask]:
         """Pixels of points in the camera frame, and whether each has one.
 
-        A point without a pixel (behind a perspective camera, at its centre, beyond the model's valid radius) is
-        NaN and False. The pixel may lie outside the image.
+        A point without a pixel is NaN and False: behind a perspective camera, at the centre of any, straight behind a
+        fisheye, straight above or below a panorama, or beyond the range in which the model is one to one
+        (`max_angle`). Fisheye models do see points behind their image plane within that range. The pixel may lie
+        outside the image.
         """
-        return _kernels.project(self.model_info.model_id, self.params, np.ascontiguousarray(points3D))
+        return _kernels.project(self.model_info.model_id, self.params, readonly(points3D, (None, 3)))
 
-    def project_with_jacobians(
-        self, points3D: Points3D
-    ) -> tuple[Points2D, np.ndarray, np.ndarray, Mask]:
-        """Pixels, their derivatives (N, 2, 3) by the point and (N, 2, K) by the parameters, and validity."""
+    def project_with_jacobians(self, points3D: Points3D) -> tuple[Points2D, _ByPoint, _ByParams, Mask]:
+        """Pixels, their derivatives by the point and by the parameters, and validity.
+
+        The derivatives of a point without a pixel are zero.
+        """
         points2D, by_point, by_params, valid = _kernels.project_with_jacobians(
-            self.model_info.model_id, self.params, np.ascontiguousarray(points3D)
+            self.model_info.model_id, self.params, readonly(points3D, (None, 3))
         )
         return points2D, by_point, by_params[:, :, : len(self.params)], valid
 
     def unproject(self, points2D: Points2D) -> tuple[Rays, Mask]:
-        """Unit rays in the camera frame of pixels, and whether each has one (NaN and False where not)."""
-        return _kernels.unproject(self.model_info.model_id, self.params, np.ascontiguousarray(points2D))
+        """Unit rays in the camera frame of pixels, and whether each has one.
+
+        A pixel that no ray reaches (beyond the image of `max_angle`; above or below a panorama) is NaN and False.
+        A panorama continues periodically to its left and right.
+        """
+        return _kernels.unproject(self.model_info.model_id, self.params, readonly(points2D, (None, 2)))
+
+
+def _eucm_max_angle(alpha: float, beta: float) -> float:
+    """Where z = −w d: the rim of the ellipsoid (α > ½) or the ray parallel to the image plane of m = 0."""
+    w = (1 - alpha) / alpha if alpha > 0.5 else alpha / (1 - alpha)
+    return math.atan2(math.sqrt(max(1 - w * w, 0.0)), -w * math.sqrt(beta))

@@ -49,9 +49,7 @@ MODELS: tuple[CameraModel, ...] = (
     CameraModel("FULL_OPENCV", 6, (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
     CameraModel("SIMPLE_RADIAL_FISHEYE", 8, (*_F, "k"), is_fisheye=True),
     CameraModel("RADIAL_FISHEYE", 9, (*_F, "k1", "k2"), is_fisheye=True),
-    CameraModel(
-        "THIN_PRISM_FISHEYE", 10, (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True
-    ),
+    CameraModel("THIN_PRISM_FISHEYE", 10, (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
     CameraModel("EUCM", 16, (*_FXY, "alpha", "beta"), is_fisheye=True),
     CameraModel("EQUIRECTANGULAR", 17, ("w", "h"), is_fisheye=True),
 )
