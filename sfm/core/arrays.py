@@ -7,7 +7,8 @@ signature (`N`, `M`) must agree there.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeAlias
+from types import EllipsisType, MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int32, Integer, UInt8
@@ -25,7 +26,11 @@ Indices: TypeAlias = Integer[np.ndarray, " M"]
 IndexPairs: TypeAlias = Int32[np.ndarray, "M 2"]
 Matrix3: TypeAlias = Float64[np.ndarray, "3 3"]
 Vector: TypeAlias = Float64[np.ndarray, " K"]
-FloatArray: TypeAlias = Float64[np.ndarray, "..."]
+if TYPE_CHECKING:
+    FloatArray: TypeAlias = Float64[np.ndarray, "..."]
+else:
+    FloatArray: TypeAlias = Float64[np.ndarray, "..."] | np.float64
+"""Numbers with any batch shape; NumPy itself hands out the batch of shape () as a scalar."""
 BoolArray: TypeAlias = Bool[np.ndarray, "..."]
 ImageU8: TypeAlias = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
 """An image at the edge of the program; colour is RGB."""
@@ -38,14 +43,16 @@ class Value:
     """Base of the data types.
 
     Rebuilding through the constructor keeps arrays read-only across processes: pickle protocols below 5
-    return them writable. Equality is identity, since `==` of arrays is an array.
+    return them writable, and a read-only view of a mapping cannot be pickled at all. Equality is identity,
+    since `==` of arrays is an array.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), tuple(getattr(self, f.name) for f in dataclasses.fields(self))
+        values = [getattr(self, f.name) for f in dataclasses.fields(self)]
+        return type(self), tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
 
-def readonly(array: Any, shape: tuple[int | None, ...], dtype: DTypeLike = np.float64) -> np.ndarray:
+def readonly(array: Any, shape: tuple[int | EllipsisType | None, ...], dtype: DTypeLike = np.float64) -> np.ndarray:
     """A read-only view of `array` as `dtype`; copies only where the type or the layout demands it.
 
     Args:
@@ -53,7 +60,7 @@ def readonly(array: Any, shape: tuple[int | None, ...], dtype: DTypeLike = np.fl
     Raises:
         ValueError: the shape is another.
     """
-    view = np.ascontiguousarray(array, dtype=dtype).view()
+    view = np.asarray(array, dtype=dtype, order="C").view()  # ascontiguousarray would make a scalar (1,)
     if shape and shape[0] is ...:
         tail = shape[1:]
         actual = view.shape[view.ndim - len(tail) :] if view.ndim >= len(tail) else None

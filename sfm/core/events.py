@@ -6,7 +6,7 @@ Progress bars, the JSON log, the report, the live view and tests are observers. 
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,6 +102,7 @@ class BundleAdjusted(Event):
     reason: str
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Anything that can be told of an event."""
 
@@ -110,5 +111,5 @@ class Observer(Protocol):
         ...
 
 
-def SILENT(event: Event, /) -> None:  # noqa: N802 - reads as the constant that it is
+def SILENT(event: Event, /) -> None:
     """The observer that does nothing."""

@@ -7,6 +7,7 @@ sums are taken over a fixed number of chunks in a fixed order: the output is bit
 from __future__ import annotations
 
 import collections
+import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -47,6 +48,8 @@ def ordered_map(
 
 def chunk_bounds(count: int, chunks: int) -> list[tuple[int, int]]:
     """Splits `range(count)` into at most `chunks` contiguous, nearly equal, non-empty ranges."""
-    chunks = max(1, min(chunks, count))
+    chunks = min(max(1, chunks), count)
+    if chunks == 0:
+        return []
     edges = [count * k // chunks for k in range(chunks + 1)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(itertools.pairwise(edges))

@@ -86,9 +86,7 @@ def triangulate_pairs(R1, t1, R2, t2, rays1, rays2):
     for i in range(len(rays1)):
         found = triangulate_two_rays(R1, t1, rays1[i], R2, t2, rays2[i], points[i])
         in_front[i] = (
-            found
-            and range_along(R1, t1, rays1[i], points[i]) > 0
-            and range_along(R2, t2, rays2[i], points[i]) > 0
+            found and range_along(R1, t1, rays1[i], points[i]) > 0 and range_along(R2, t2, rays2[i], points[i]) > 0
         )
     return points, in_front
 

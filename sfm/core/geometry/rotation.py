@@ -39,7 +39,7 @@ def left_jacobian(omega: FloatArray) -> FloatArray:
     theta = np.linalg.norm(omega, axis=-1)[..., None, None]
     small = theta < _SMALL_ANGLE
     t = np.where(small, 1.0, theta)
-    b = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(t)) / t**2)
+    b = np.where(small, 0.5 - theta**2 / 24, 2 * np.sin(t / 2) ** 2 / t**2)  # 1 − cos t would cancel
     c = np.where(small, 1 / 6 - theta**2 / 120, (t - np.sin(t)) / t**3)
     k = skew(omega)
     return np.eye(3) + b * k + c * (k @ k)
@@ -142,7 +142,7 @@ class Rotation3(Value):
     @property
     def angle(self) -> FloatArray:
         """Angles of rotation in radians, in [0, π], with the batch shape."""
-        return 2 * np.arctan2(np.linalg.norm(self.wxyz[..., 1:], axis=-1), np.abs(self.wxyz[..., 0]))
+        return np.asarray(2 * np.arctan2(np.linalg.norm(self.wxyz[..., 1:], axis=-1), np.abs(self.wxyz[..., 0])))
 
     def inverse(self) -> Rotation3:
         """`a_from_b`."""

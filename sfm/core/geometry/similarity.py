@@ -123,10 +123,16 @@ class Sim3(Value):
             return self.scale[..., None] * (self.rotation @ other) + self.translation
         return NotImplemented
 
+    def __getitem__(self, index: Any) -> Sim3:
+        """Selects from the batch."""
+        translation = np.expand_dims(self.translation, -2)[index][..., 0, :]
+        return Sim3(np.asarray(self.scale[index]), self.rotation[index], translation)
 
-def estimate_similarity(
-    points_in_a: Points3D, points_in_b: Points3D, *, with_scale: bool = True
-) -> Sim3 | Rejected:
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+
+def estimate_similarity(points_in_a: Points3D, points_in_b: Points3D, *, with_scale: bool = True) -> Sim3 | Rejected:
     """The similarity that minimises Σ ‖s R a + t − b‖².
 
     Two distinct points do not fix the rotation about their line: rejected, as are collinear points.
@@ -145,9 +151,12 @@ def estimate_similarity(
     mean_a, mean_b = points_in_a.mean(0), points_in_b.mean(0)
     a, b = points_in_a - mean_a, points_in_b - mean_b
     u, d, vt = np.linalg.svd(b.T @ a / len(a))
-    if not d[1] > 1e-12 * d[0]:
+    spread_a, spread_b = np.sqrt(np.square(a).sum(1).mean()), np.sqrt(np.square(b).sum(1).mean())
+    # Coordinates far from the origin are rounded, which lifts a collinear set off its line.
+    rounding = 1e-15 * (np.linalg.norm(mean_a) * spread_b + np.linalg.norm(mean_b) * spread_a)
+    if not d[1] > 1e-12 * d[0] + rounding:
         return Rejected("collinear_points", f"singular values {d[0]:.3g}, {d[1]:.3g}")
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     r = (u * sign) @ vt
-    s = float((d * sign).sum() / np.square(a).sum(1).mean()) if with_scale else 1.0
-    return Sim3(np.float64(s), Rotation3.from_matrix(r), mean_b - s * r @ mean_a)
+    s = float((d * sign).sum() / spread_a**2) if with_scale else 1.0
+    return Sim3(np.asarray(s), Rotation3.from_matrix(r), mean_b - s * r @ mean_a)

@@ -96,7 +96,7 @@ def triangulation_angles(centers1: FloatArray, centers2: FloatArray, points3D: F
         centers1: (..., 3), as `centers2`; all three arguments broadcast against each other.
     """
     a, b = points3D - centers1, points3D - centers2
-    return np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.abs((a * b).sum(-1)))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.abs((a * b).sum(-1))))
 
 
 def in_front(cams_from_world: Rigid3, rays: Rays, points3D: Points3D) -> Mask:

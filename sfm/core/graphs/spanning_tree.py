@@ -14,8 +14,8 @@ def maximum_spanning_tree(
 ) -> Int64[np.ndarray, " T"]:
     """Rows of the edges that connect all that can be connected, at the greatest sum of weights.
 
-    Of equally heavy edges the one with the smaller nodes is preferred (of repeated ones the first), so the tree does not depend on the order of
-    the edges. A graph of several components gives a tree for each: count − T is their number.
+    Of equally heavy edges the one with the smaller nodes is preferred (of repeated ones the first), so the tree does
+    not depend on the order of the edges. A graph of several components gives a tree for each: there are count − T.
 
     Args:
         count: the nodes are 0 … count − 1.

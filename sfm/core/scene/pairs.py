@@ -69,8 +69,5 @@ class ViewGraph(Value):
             raise ValueError("a pair's first image id must be below its second")
         object.__setattr__(self, "pairs", MappingProxyType(dict(sorted(self.pairs.items()))))
 
-    def __reduce__(self) -> tuple[object, ...]:
-        return ViewGraph, (dict(self.pairs),)
-
     def __len__(self) -> int:
         return len(self.pairs)

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from jaxtyping import Float64, Int32, Int64, UInt8
 
-from sfm.core.arrays import Points2D, Points3D, Value, readonly
+from sfm.core.arrays import Points2D, Value, readonly
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene.rigs import Frame, Rig
@@ -80,8 +80,8 @@ class Reconstruction(Value):
     image_camera_ids: Int32[np.ndarray, " I"]
     cams_from_world: Rigid3
     keypoint_offsets: Int64[np.ndarray, " I1"]
-    keypoints: Points2D
-    points3D: Points3D
+    keypoints: Float64[np.ndarray, "K 2"]
+    points3D: Float64[np.ndarray, "P 3"]
     point_ids: Int64[np.ndarray, " P"]
     colors: UInt8[np.ndarray, "P 3"]
     errors: Float64[np.ndarray, " P"]
@@ -105,14 +105,13 @@ class Reconstruction(Value):
             raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
         if np.any(np.diff(self.image_ids) <= 0):
             raise ValueError("image ids must be sorted and unique")
+        if self.keypoint_offsets[0] != 0 or np.any(np.diff(self.keypoint_offsets) < 0):
+            raise ValueError("keypoint offsets must start at 0 and never fall")
+        if not np.isin(self.tracks.image_ids, self.image_ids).all():
+            raise ValueError("tracks name images that are absent")
         missing = set(self.image_camera_ids.tolist()) - set(self.cameras)
         if missing:
             raise ValueError(f"images name cameras that are absent: {sorted(missing)}")
-
-    def __reduce__(self) -> tuple[object, ...]:
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        fields["cameras"] = dict(self.cameras)
-        return Reconstruction, tuple(fields.values())
 
     @property
     def image_rows(self) -> Int64[np.ndarray, " n"]:

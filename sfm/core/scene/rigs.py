@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
+from types import MappingProxyType
 
 from sfm.core.arrays import Value
 from sfm.core.geometry.rigid import Rigid3
@@ -20,6 +21,11 @@ class Rig(Value):
     ref_camera_id: int
     sensors_from_rig: Mapping[int, Rigid3 | None] = dataclasses.field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if self.ref_camera_id in self.sensors_from_rig:
+            raise ValueError(f"camera {self.ref_camera_id} is the rig's reference and has no pose in it")
+        object.__setattr__(self, "sensors_from_rig", MappingProxyType(dict(self.sensors_from_rig)))
+
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Frame(Value):
@@ -29,3 +35,6 @@ class Frame(Value):
     rig_id: int
     rig_from_world: Rigid3
     image_ids: Mapping[int, int]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image_ids", MappingProxyType(dict(self.image_ids)))
