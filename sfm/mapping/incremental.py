@@ -1,0 +1,278 @@
+"""Incremental mapping: grow a model from two images, one image at a time.
+
+    start from a good pair → adjust
+    while an image sees enough points:
+        resect it → triangulate what it adds → adjust its neighbourhood
+        when the model has grown by a tenth: adjust everything, complete tracks, drop what does not fit
+    adjust everything to convergence
+
+Images that are left start the next model. Every step that goes wrong is undone; nothing already won is given up.
+
+Reference:
+    Schönberger & Frahm, Structure-from-Motion Revisited, CVPR 2016.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from sfm.bundle import BundleConfig
+from sfm.core.arrays import Points2D
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.events import SILENT, ImageRegistered, Observer
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.scene import Reconstruction, ViewGraph
+from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
+from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
+from sfm.mapping.registration import Resection, next_images, resect
+from sfm.mapping.state import MAX_PARAMS, Scene, State
+from sfm.mapping.tracks import build_tracks
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class MappingConfig:
+    """How models grow; angles in degrees, errors in px of the full image."""
+
+    min_track_length: int = 3
+    """Views that a track must have to make a point: no third view checks a shorter one. Shorter ones are used where
+    the images at hand have fewer than `init_min_inliers` of the others."""
+    init_min_inliers: int = 100
+    """Matches of the first pair; halved and quartered where no pair has them."""
+    init_min_angle_deg: float = 16.0
+    """Median angle between the rays of the first pair; relaxed with the matches."""
+    init_max_forward: float = 0.95
+    """Largest part of the first pair's motion along the optical axis."""
+    init_trials: int = 20
+    """First pairs tried for a model."""
+    resection_max_error_px: float = 12.0
+    """Reprojection error of a point that agrees with a new pose; wide, as the model is not yet adjusted to it."""
+    resection_min_inliers: int = 30
+    """Points that must agree with a new pose."""
+    resection_min_inlier_ratio: float = 0.25
+    """Share of the visible points that must agree."""
+    resection_trials: int = 3
+    """Attempts for an image; it is tried again only when it sees more points than before."""
+    triangulation_max_error_px: float = 8.0
+    """Reprojection error for a view to join a new point, before adjustment."""
+    max_error_px: float = 4.0
+    """Reprojection error above which an adjusted observation is dropped."""
+    min_angle_deg: float = 1.5
+    """Points whose widest pair of rays is narrower are dropped: their depth is not known."""
+    local_images: int = 5
+    """Neighbours adjusted with a new image."""
+    global_growth: float = 1.1
+    """Everything is adjusted when images or points have grown by this factor."""
+    loss_scale_px: float = 1.0
+    """Residual at which the soft-L1 loss of the adjustments turns from squared to linear."""
+    min_model_images: int = 3
+    """Later models with fewer images are not kept; the first is."""
+    max_models: int = 20
+    """Models tried for at most."""
+
+
+def map_incrementally(
+    view_graph: ViewGraph,
+    keypoints: Mapping[int, Points2D],
+    cameras: Mapping[int, Camera],
+    image_cameras: Mapping[int, int],
+    image_names: Mapping[int, str],
+    config: MappingConfig = MappingConfig(),
+    *,
+    seed: int = 0,
+    threads: int = 1,
+    refine_intrinsics: bool = True,
+    observer: Observer = SILENT,
+) -> list[Reconstruction]:
+    """Models of all images that hang together, the one with most images first; empty where no pair starts one.
+
+    Args:
+        keypoints: by image id, in px; the rows are what the matches of `view_graph` count.
+        cameras: by camera id. Their focal lengths and distortions are refined unless `refine_intrinsics` is false.
+        image_cameras: camera id of each image id.
+        seed: of the resections' random samples.
+        threads: changes the time, not the result.
+    """
+    tracks = build_tracks(view_graph, keypoints, min_length=2)
+    scene = Scene.build(tracks, keypoints, cameras, image_cameras, image_names)
+    mapper = _Mapper(scene, view_graph, config, seed, threads, refine_intrinsics, observer)
+    models: list[State] = []
+    used = np.zeros(len(scene.image_ids), bool)
+    while len(models) < config.max_models and (state := mapper.grow_model(used)) is not None:
+        used |= state.registered
+        models.append(state)
+    models = [s for k, s in enumerate(models) if k == 0 or s.registered.sum() >= config.min_model_images]
+    models.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
+    return [state.to_reconstruction() for state in models]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Mapper:
+    """The inputs of one mapping, so that its steps read as sentences."""
+
+    scene: Scene
+    view_graph: ViewGraph
+    config: MappingConfig
+    seed: int
+    threads: int
+    refine_intrinsics: bool
+    observer: Observer
+
+    def grow_model(self, used: np.ndarray) -> State | None:
+        """One model among the images that are not `used`; None where no pair starts one."""
+        state = self.start_from_best_pair(used)
+        if state is None:
+            return None
+        images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
+        tried_at: dict[int, list[int]] = {}
+        while (registered := self.register_next(state, used, tried_at)) is not None:
+            images, points = int(state.registered.sum()), int(state.has_point.sum())
+            growth = self.config.global_growth
+            if images >= growth * images_then or points >= growth * points_then:
+                self.refine(state, rounds=2)
+                images_then, points_then = images, int(state.has_point.sum())
+            else:
+                self.adjust_around(state, registered)
+        self.refine(state, rounds=5, final=True)
+        return state
+
+    def start_from_best_pair(self, used: np.ndarray) -> State | None:
+        """A model of two images."""
+        config = self.config
+        blank = State.start(self.scene)
+        blank.registered |= used
+        candidates = rank_initial_pairs(blank, self.view_graph)
+        acceptable = acceptable_pairs(
+            candidates, config.init_min_inliers, np.deg2rad(config.init_min_angle_deg), config.init_max_forward
+        )
+        for _, pair in zip(range(config.init_trials), acceptable, strict=False):
+            state = self.start_from(pair)
+            if state is not None:
+                return state
+        return None
+
+    def start_from(self, pair: InitialPair) -> State | None:
+        """The two-image model of a pair, if enough of its points survive adjustment."""
+        state = State.start(self.scene)
+        state.set_pose(pair.image1, Rigid3.identity())
+        state.set_pose(pair.image2, pair.cam2_from_cam1)
+        self.triangulate_seen_by(state, np.array([pair.image1, pair.image2]))
+        self.refine(state, rounds=2)
+        points = int(state.has_point.sum())
+        if points < self.config.resection_min_inliers:
+            return None
+        for image in (pair.image1, pair.image2):
+            self.tell(state, image, Resection(points, points))
+        return state
+
+    def register_next(self, state: State, used: np.ndarray, tried_at: dict[int, list[int]]) -> int | None:
+        """Registers the image that sees the points best; None when no image can be registered any more."""
+        config = self.config
+        for image, visible in next_images(state, config.resection_min_inliers):
+            attempts = tried_at.setdefault(image, [])
+            if used[image] or len(attempts) >= config.resection_trials or (attempts and visible <= attempts[-1]):
+                continue
+            camera_row = self.scene.image_camera[image]
+            is_new = not np.any(state.registered & (self.scene.image_camera == camera_row))
+            outcome = resect(
+                state,
+                image,
+                max_error_px=config.resection_max_error_px,
+                min_inliers=config.resection_min_inliers,
+                min_inlier_ratio=config.resection_min_inlier_ratio,
+                refine_focal=self.refine_intrinsics
+                and is_new
+                and not self.scene.cameras[camera_row].has_prior_focal_length,
+                rng=np.random.default_rng([self.seed, int(self.scene.image_ids[image]), len(attempts)]),
+            )
+            attempts.append(visible)
+            self.tell(state, image, outcome)
+            if isinstance(outcome, Resection):
+                self.triangulate_seen_by(state, np.array([image]))
+                return image
+        return None
+
+    def triangulate_seen_by(self, state: State, images: np.ndarray) -> None:
+        """Makes and completes points on the tracks of these images."""
+        config, tracks = self.config, state.tracks_seen_by(images)
+        if len(tracks):
+            long = np.diff(self.scene.offsets)[tracks] >= config.min_track_length
+            tracks = tracks[long] if long.sum() >= config.init_min_inliers else tracks
+            state.triangulate(tracks, config.triangulation_max_error_px, np.deg2rad(config.min_angle_deg))
+
+    def adjust_around(self, state: State, image: int) -> None:
+        """Local adjustment after a registration."""
+        config = self.config
+        images = neighbourhood(state, image, config.local_images, np.deg2rad(6.0))
+        bundle = BundleConfig(
+            loss="soft_l1", loss_scale_px=config.loss_scale_px, max_iterations=15, relative_cost_tolerance=1e-4
+        )
+        fixed = np.zeros((len(self.scene.cameras), MAX_PARAMS), bool)
+        adjust_locally(state, images, bundle, free_params=fixed, threads=self.threads, observer=self.observer)
+        tracks = state.tracks_seen_by(images)
+        state.filter(tracks, config.max_error_px, np.deg2rad(config.min_angle_deg))
+
+    def refine(self, state: State, *, rounds: int, final: bool = False) -> None:
+        """Adjusts everything, then completes tracks and drops what does not fit, until little changes."""
+        config = self.config
+        min_angle = np.deg2rad(config.min_angle_deg)
+        bundle = BundleConfig(
+            loss="soft_l1",
+            loss_scale_px=config.loss_scale_px,
+            max_iterations=100 if final else 30,
+            relative_cost_tolerance=1e-6 if final else 1e-4,
+        )
+        for _ in range(rounds):
+            before = int(state.on.sum())
+            self.adjust_all(state, bundle)
+            all_tracks = np.arange(len(state.has_point))
+            dropped = state.filter(all_tracks, config.max_error_px, min_angle)
+            self.triangulate_seen_by(state, np.flatnonzero(state.registered))
+            dropped += state.filter(all_tracks, config.max_error_px, min_angle)
+            changed = dropped + abs(int(state.on.sum()) - before)
+            if changed <= 0.0005 * before:
+                break
+        if final:
+            self.adjust_all(state, dataclasses.replace(bundle, relative_cost_tolerance=1e-8))
+
+    def adjust_all(self, state: State, bundle: BundleConfig) -> None:
+        """Adjusts everything; a camera that this drives out of bounds goes back and is held."""
+        free = self.free_params(state)
+        before = state.copy()
+        adjust_globally(state, bundle, free_params=free, threads=self.threads, observer=self.observer)
+        bogus = [row for row in np.flatnonzero(free.any(1)).tolist() if has_bogus_params(state, row)]
+        if bogus:
+            for name in ("params", "ray", "R", "t", "points"):
+                setattr(state, name, getattr(before, name))
+            free[bogus] = False
+            adjust_globally(state, bundle, free_params=free, threads=self.threads, observer=self.observer)
+
+    def free_params(self, state: State) -> np.ndarray:
+        """Which parameters (C, 12) are adjusted: focal length and distortion, never the principal point."""
+        free = np.zeros((len(self.scene.cameras), MAX_PARAMS), bool)
+        if self.refine_intrinsics:
+            enough = state.registered.sum() > 2
+            for row in np.unique(self.scene.image_camera[state.registered]):
+                camera = self.scene.cameras[row]
+                if enough or not camera.has_prior_focal_length:
+                    free[row, list(camera.model_info.focal_indices)] = True
+                if enough:
+                    free[row, list(camera.model_info.extra_indices)] = True
+        return free
+
+    def tell(self, state: State, image: int, outcome: Resection | Rejected) -> None:
+        """Tells the observer how a registration went."""
+        ok = isinstance(outcome, Resection)
+        self.observer(
+            ImageRegistered(
+                name=self.scene.image_names[image],
+                registered=int(state.registered.sum()),
+                points=int(state.has_point.sum()),
+                inliers=outcome.inliers if ok else 0,
+                visible=outcome.visible if ok else 0,
+                reason="" if ok else f"{outcome.reason}: {outcome.detail}",
+            )
+        )

@@ -1,0 +1,131 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sfm.core.cameras import Camera
+from sfm.core.events import ImageRegistered
+from sfm.core.geometry.similarity import Sim3, estimate_similarity
+from sfm.core.scene import ViewGraph
+from sfm.mapping import map_incrementally
+from tests.mapping.scenes import PointScene
+
+
+def _map(scene, **options):
+    return map_incrementally(
+        scene.view_graph, scene.keypoints, scene.cameras, scene.image_cameras, scene.image_names, **options
+    )
+
+
+def _pose_errors(scene, model):
+    """Largest rotation error in degrees and centre error in scene units, after alignment of the centres."""
+    truth = [scene.poses[i - 1] for i in model.image_ids.tolist()]
+    centers = np.stack([pose.center for pose in truth])
+    world_from_model = estimate_similarity(model.cams_from_world.center, centers)
+    assert isinstance(world_from_model, Sim3)
+    aligned = world_from_model.transform_pose(model.cams_from_world)
+    rotation = max(float((aligned[k].rotation @ pose.rotation.inverse()).angle) for k, pose in enumerate(truth))
+    return np.rad2deg(rotation), float(np.abs(aligned.center - centers).max())
+
+
+def test_exact_matches_give_exact_poses():
+    scene = PointScene()
+    (model,) = _map(scene, refine_intrinsics=False)
+    rotation_deg, position = _pose_errors(scene, model)
+    assert len(model.image_names) == 8
+    assert rotation_deg < 1e-4
+    assert position < 1e-5
+    assert len(model.tracks) == 400
+    assert model.errors.max() < 1e-3
+
+
+def test_noise_and_wrong_matches_leave_poses_near_the_truth():
+    scene = PointScene(noise_px=0.5, outliers=0.3, seed=1)
+    (model,) = _map(scene, refine_intrinsics=False)
+    rotation_deg, position = _pose_errors(scene, model)
+    assert len(model.image_names) == 8
+    assert 1e-4 < rotation_deg < 0.1
+    assert position < 0.01
+    assert 0.3 < model.errors.mean() < 0.8
+
+
+def test_a_wrong_focal_length_is_corrected():
+    scene = PointScene(images=10, noise_px=0.2, seed=2)
+    guess = Camera("SIMPLE_RADIAL", 1000, 800, np.array([1100.0, 500, 400, 0]))
+    (model,) = _map(_with_camera(scene, guess))
+    assert len(model.image_names) == 10
+    assert model.cameras[1].params[0] == pytest.approx(900, rel=5e-3)
+    assert model.cameras[1].params[3] == pytest.approx(-0.05, abs=0.01)
+
+
+def _with_camera(scene, camera):
+    scene.cameras = {1: camera}
+    return scene
+
+
+def test_given_intrinsics_stay_as_they_are():
+    scene = PointScene(noise_px=0.5)
+    (model,) = _map(scene, refine_intrinsics=False)
+    assert np.array_equal(model.cameras[1].params, scene.camera.params)
+
+
+def test_threads_do_not_change_a_bit():
+    scene = PointScene(noise_px=0.5, outliers=0.2)
+    one, two = _map(scene, threads=1)[0], _map(scene, threads=2)[0]
+    assert np.array_equal(one.points3D, two.points3D)
+    assert np.array_equal(one.cams_from_world.matrix, two.cams_from_world.matrix)
+    assert np.array_equal(one.tracks.feature_ids, two.tracks.feature_ids)
+
+
+def test_images_without_common_matches_make_models_of_their_own():
+    scene = PointScene(images=9)
+    together = {pair: g for pair, g in scene.view_graph.pairs.items() if (pair[0] <= 5) == (pair[1] <= 5)}
+    scene.view_graph = ViewGraph(together)
+    models = _map(scene, refine_intrinsics=False)
+    assert [m.image_ids.tolist() for m in models] == [[1, 2, 3, 4, 5], [6, 7, 8, 9]]
+
+
+def test_an_image_that_matches_nothing_is_left_out():
+    scene = PointScene(images=6)
+    scene.view_graph = ViewGraph({pair: g for pair, g in scene.view_graph.pairs.items() if 4 not in pair})
+    (model,) = _map(scene, refine_intrinsics=False)
+    assert model.image_ids.tolist() == [1, 2, 3, 5, 6]
+
+
+def test_two_images_make_a_model():
+    (model,) = _map(PointScene(images=2, spread_deg=20.0), refine_intrinsics=False)
+    assert model.image_ids.tolist() == [1, 2]
+    assert len(model.tracks) == 400
+
+
+def test_no_pair_makes_no_model():
+    scene = PointScene(images=3)
+    scene.view_graph = ViewGraph({})
+    assert _map(scene) == []
+
+
+def test_a_rotation_in_place_makes_no_model():
+    scene = PointScene(images=3)
+    pairs = {
+        pair: dataclasses.replace(
+            g, matches=np.repeat(np.arange(400, dtype=np.int32)[:, None], 2, 1), cam2_from_cam1=g.cam2_from_cam1
+        )
+        for pair, g in scene.view_graph.pairs.items()
+    }
+    rays, _ = scene.camera.unproject(scene.keypoints[1])
+    for i, pose in enumerate(scene.poses, start=1):
+        turned = (pose.rotation @ scene.poses[0].rotation.inverse()) @ rays
+        scene.keypoints[i] = scene.camera.project(turned)[0]
+    keep = np.all([np.isfinite(xy).all(1) for xy in scene.keypoints.values()], axis=0)
+    scene.keypoints = {i: xy[keep] for i, xy in scene.keypoints.items()}
+    matches = np.repeat(np.arange(keep.sum(), dtype=np.int32)[:, None], 2, 1)
+    scene.view_graph = ViewGraph({p: dataclasses.replace(g, matches=matches) for p, g in pairs.items()})
+    assert _map(scene, refine_intrinsics=False) == []
+
+
+def test_every_registration_is_told():
+    events = []
+    scene = PointScene(images=5)
+    _map(scene, refine_intrinsics=False, observer=events.append)
+    told = [e.name for e in events if isinstance(e, ImageRegistered) and not e.reason]
+    assert sorted(told) == [f"{i:03d}.jpg" for i in range(1, 6)]
