@@ -1,0 +1,124 @@
+"""Writes that are there whole or not at all.
+
+A file is written under a temporary name in its own folder and then renamed over the target, which POSIX and Windows
+do in one step. A reader, or a run that was killed and starts again, never meets half a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from sfm.core.errors import InputError
+
+Chunks: TypeAlias = Iterable[Any]
+"""Pieces of a file, each `bytes` or a contiguous array: what `file.write` takes."""
+
+
+@contextlib.contextmanager
+def os_errors(path: Path) -> Iterator[None]:
+    """Turns the system's refusals into an `InputError` that says what to do about them."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(_cause(error), path=path, remedy=_remedy(error)) from error
+
+
+def _cause(error: OSError) -> str:
+    return (error.strerror or str(error)).lower()
+
+
+def _remedy(error: OSError) -> str:
+    match error:
+        case PermissionError():
+            return "check the permissions of the file and of its folder"
+        case FileNotFoundError():
+            return "check the spelling of the path"
+        case FileExistsError() | NotADirectoryError() | IsADirectoryError():
+            return "choose another path, or move what lies there"
+    return "choose another disk or folder"
+
+
+@contextlib.contextmanager
+def atomic_path(target: Path, *, sync: bool = False) -> Iterator[Path]:
+    """Lends a temporary path beside `target`; what was written there replaces `target` when the block ends well.
+
+    Args:
+        sync: wait until the file is on the disk, so that it also survives a power cut.
+    Raises:
+        InputError: the system refuses, e.g. in a read-only folder.
+    """
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    with os_errors(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield temporary
+            if sync:
+                _sync(temporary)
+            os.replace(temporary, target)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def write_chunks(target: Path, chunks: Chunks, *, sync: bool = False) -> None:
+    """Writes the pieces one after the other; see `atomic_path`."""
+    with atomic_path(target, sync=sync) as temporary, temporary.open("wb") as file:
+        for chunk in chunks:
+            file.write(chunk)
+
+
+def write_bytes(target: Path, data: bytes, *, sync: bool = False) -> None:
+    """Writes `data`; see `atomic_path`."""
+    write_chunks(target, [data], sync=sync)
+
+
+def write_text(target: Path, text: str, *, sync: bool = False) -> None:
+    """Writes `text` as UTF-8 with line feeds on every system; see `atomic_path`."""
+    write_chunks(target, [text.encode()], sync=sync)
+
+
+def write_folder(folder: Path, files: Mapping[str, Chunks], *, obsolete: Iterable[str] = ()) -> None:
+    """Writes several files that belong together.
+
+    All of them are written before the first takes its place. A new folder appears in one step; in a folder that
+    exists the files are exchanged one by one, so that only a kill within these few renames can leave a mixture.
+
+    Args:
+        files: by name.
+        obsolete: names of files in `folder` that the new ones supersede; they are removed last.
+    Raises:
+        InputError: the system refuses; `folder` is then as it was, save for such a mixture.
+    """
+    folder = Path(os.path.abspath(folder))
+    exists = folder.is_dir()
+    name = f".{folder.name}.{secrets.token_hex(4)}.tmp"
+    staging = folder / name if exists else folder.with_name(name)
+    with os_errors(folder):
+        try:
+            staging.mkdir(parents=True)
+            for name, chunks in files.items():
+                with (staging / name).open("wb") as file:
+                    for chunk in chunks:
+                        file.write(chunk)
+            if not exists:
+                os.replace(staging, folder)
+                return
+            for name in files:
+                os.replace(staging / name, folder / name)
+            for name in obsolete:
+                (folder / name).unlink(missing_ok=True)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

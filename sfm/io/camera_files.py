@@ -1,0 +1,133 @@
+"""Calibrations on disk: COLMAP's cameras.txt or .bin, and the camera file of Parallax.
+
+[camera]
+name = "left"                     # optional
+model = "OPENCV"                  # a model of COLMAP
+width = 4000
+height = 3000
+pixel_center = 0.5                # where the centre of the first pixel is: 0.5 (default), or 0.0 as in OpenCV
+params = [3200.0, 3200.0, 2000.0, 1500.0, 0.01, 0.0, 0.0, 0.0]      # fx, fy, cx, cy, k1, k2, p1, p2
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm.core.cameras import MODELS, Camera, model_by_name
+from sfm.core.errors import ConfigError, FormatError
+from sfm.io import colmap_binary, colmap_text
+from sfm.io.atomic import os_errors, write_text
+
+_REQUIRED = ("model", "width", "height", "params")
+_KEYS = ("name", *_REQUIRED, "pixel_center")
+
+
+def read_intrinsics(path: Path | str) -> dict[int, Camera]:
+    """The cameras of a calibration file by id; one camera alone is meant for all images.
+
+    Their focal lengths count as measured (`has_prior_focal_length`).
+
+    Raises:
+        InputError: the file cannot be opened.
+        FormatError: it is not what its suffix promises, or holds no camera.
+        ConfigError: a key of the camera file is unknown, missing or out of its range.
+    """
+    path = Path(path)
+    match path.suffix.lower():
+        case ".toml":
+            cameras = {1: _read_toml(path)}
+        case ".bin":
+            cameras = colmap_binary.read_cameras(path)
+        case ".txt":
+            cameras = colmap_text.read_cameras(path)
+        case _:
+            raise FormatError(
+                "is no calibration file", path=path, remedy="name a cameras.txt or .bin of COLMAP, or a camera .toml"
+            )
+    if not cameras:
+        raise FormatError("holds no camera", path=path)
+    for camera_id, camera in cameras.items():
+        if min(camera.width, camera.height) <= 0 or not np.isfinite(camera.params).all():
+            raise FormatError(f"camera {camera_id} has no size, or a parameter that is not finite", path=path)
+    return {
+        camera_id: Camera(camera.model, camera.width, camera.height, camera.params, has_prior_focal_length=True)
+        for camera_id, camera in cameras.items()
+    }
+
+
+def write_camera_toml(path: Path | str, camera: Camera, *, name: str = "") -> None:
+    """Writes one camera; every number reads back as it is.
+
+    Raises:
+        InputError: the system refuses.
+    """
+    lines = [
+        "[camera]",
+        *([f"name = {json.dumps(name, ensure_ascii=False)}"] if name else []),
+        f'model = "{camera.model}"',
+        f"width = {camera.width}",
+        f"height = {camera.height}",
+        "pixel_center = 0.5",
+        f"params = {camera.params.tolist()}  # {', '.join(camera.model_info.param_names)}",
+    ]
+    write_text(Path(path), "\n".join(lines) + "\n")
+
+
+def _read_toml(path: Path) -> Camera:
+    with os_errors(path):
+        text = path.read_bytes()
+    try:
+        document = tomllib.loads(text.decode())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FormatError(f"is no TOML: {error}", path=path) from error
+    _check_keys(document, ("camera",), path)
+    table = document.get("camera")
+    if not isinstance(table, dict):
+        raise ConfigError("has no table [camera]", path=path)
+    _check_keys(table, _KEYS, path)
+    missing = [key for key in _REQUIRED if key not in table]
+    if missing:
+        raise ConfigError(f"[camera] lacks {', '.join(missing)}", path=path)
+    return _camera(table, path)
+
+
+def _camera(table: dict[str, Any], path: Path) -> Camera:
+    if table["model"] not in (model.name for model in MODELS):
+        raise ConfigError(
+            f"unknown model {table['model']!r}{_nearest(table['model'], [m.name for m in MODELS])}", path=path
+        )
+    if not isinstance(table.get("name", ""), str):
+        raise ConfigError(f"name must be text, got {table['name']!r}", path=path)
+    for key in ("width", "height"):
+        if type(table[key]) is not int or table[key] <= 0:
+            raise ConfigError(f"{key} must be a positive integer, got {table[key]!r}", path=path)
+    if table.get("pixel_center", 0.5) not in (0, 0.5):
+        raise ConfigError(f"pixel_center must be 0.5 or 0.0, got {table['pixel_center']!r}", path=path)
+    model = model_by_name(table["model"])
+    params = _params(table["params"], model.param_names, path)
+    params[list(model.principal_point_indices)] += 0.5 - table.get("pixel_center", 0.5)
+    return Camera(model.name, table["width"], table["height"], params)
+
+
+def _params(values: Any, names: tuple[str, ...], path: Path) -> np.ndarray:
+    is_list = isinstance(values, list) and all(type(value) in (int, float) for value in values)
+    if not is_list or len(values) != len(names) or not np.isfinite(values).all():
+        raise ConfigError(f"params must be {len(names)} finite numbers: {', '.join(names)}", path=path)
+    return np.array(values, np.float64)
+
+
+def _check_keys(table: dict[str, Any], known: tuple[str, ...], path: Path) -> None:
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"unknown key {key!r}{_nearest(key, known)}", path=path)
+
+
+def _nearest(word: Any, known: Any) -> str:
+    close = difflib.get_close_matches(str(word), list(known), n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; known are {', '.join(known)}"
