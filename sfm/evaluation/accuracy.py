@@ -31,12 +31,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm.core.arrays import Vector
+from sfm.core.arrays import FloatArray, Vector
 
 THRESHOLDS_DEG = (0.5, 1.0, 3.0, 5.0, 10.0)
 
 
-def area_under_recall(errors: Vector, thresholds: Sequence[float] = THRESHOLDS_DEG, *, min_error: float = 0) -> Vector:
+def area_under_recall(
+    errors: Vector, thresholds: Sequence[float] = THRESHOLDS_DEG, *, min_error: float = 0.0
+) -> FloatArray:
     """AUC in [0, 1] at each threshold; NaN where there are no errors at all.
 
     Args:
@@ -56,7 +58,7 @@ def area_under_recall(errors: Vector, thresholds: Sequence[float] = THRESHOLDS_D
     return np.array([_area_up_to(limit, e, r) / limit for limit in limits])
 
 
-def _recall_polygon(errors: Vector, min_error: float) -> tuple[Vector, Vector]:
+def _recall_polygon(errors: Vector, min_error: float) -> tuple[FloatArray, FloatArray]:
     recall = np.arange(1, len(errors) + 1) / len(errors)
     if min_error <= 0:
         return np.r_[0.0, errors], np.r_[0.0, recall]

@@ -34,6 +34,7 @@ from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.geometry.similarity import Sim3, estimate_similarity
+from sfm.core.robust.alignment import align_robust
 
 LINE_RATIO = 0.02
 """Centres whose spread across their main direction is below this share of the spread along it count as a line.
@@ -116,7 +117,7 @@ def align_poses(
     if rank == 1:
         return Alignment(_align_lines(centers_in_a, centers_in_b, rotation), "line_and_rotations", everyone)
     translation = centers_in_b.mean(0) - rotation @ centers_in_a.mean(0)
-    return Alignment(Sim3(np.float64(1.0), rotation, translation), "rotations", everyone)
+    return Alignment(Sim3(np.ones(()), rotation, translation), "rotations", everyone)
 
 
 def _rank(centers: Points3D) -> int:
@@ -142,21 +143,17 @@ def _align_lines(centers_in_a: Points3D, centers_in_b: Points3D, rotation: Rotat
 
 def _smallest_rotation(direction: np.ndarray, target: np.ndarray) -> Rotation3:
     """The rotation of least angle that takes one unit vector to another; about any axis where they are opposite."""
-    axis = np.cross(direction, target)
-    w = 1 + direction @ target
+    axis, w = np.cross(direction, target), 1.0 + float(direction @ target)
     if w < 1e-12:
         axis, w = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]), 0.0
-    return Rotation3(np.concatenate([[w], axis]))
+    return Rotation3(np.array([w, *axis]))
 
 
 def _align_robust(
     centers_in_a: Points3D, centers_in_b: Points3D, max_error: float, rng: np.random.Generator
 ) -> Alignment | Rejected:
-    from sfm.core.robust.alignment import align_robust
-
     found = align_robust(centers_in_a, centers_in_b, max_error, rng=rng)
     if isinstance(found, Rejected):
         return found
-    b_from_a = found if isinstance(found, Sim3) else found[0]
-    inliers = np.linalg.norm(b_from_a @ centers_in_a - centers_in_b, axis=1) <= max_error
+    b_from_a, inliers = found
     return Alignment(b_from_a, "robust_centers", inliers)

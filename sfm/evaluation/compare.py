@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.core.arrays import Indices, Value, Vector, readonly
+from sfm.core.arrays import FloatArray, Indices, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -52,8 +52,8 @@ class PoseComparison(Value):
     alignment: Alignment | Rejected
     rotation_error_deg: Vector
     position_error: Vector
-    step_rotation_error_deg: Vector
-    step_translation_error: Vector
+    step_rotation_error_deg: FloatArray
+    step_translation_error: FloatArray
     relative: RelativePoseErrors
 
     def __post_init__(self) -> None:
@@ -209,7 +209,7 @@ def _alignment_json(alignment: Alignment | Rejected) -> dict[str, Any]:
     }
 
 
-def _summary(errors: Vector) -> dict[str, float | None]:
+def _summary(errors: FloatArray) -> dict[str, float | None]:
     if len(errors) == 0 or np.any(np.isnan(errors)):
         return dict.fromkeys(("median", "mean", "rmse", "max"))
     return {
@@ -220,11 +220,11 @@ def _summary(errors: Vector) -> dict[str, float | None]:
     }
 
 
-def _median(values: Vector) -> float:
+def _median(values: FloatArray) -> float:
     return float(np.median(values)) if len(values) else float("nan")
 
 
-def _root_mean_square(values: Vector) -> float:
+def _root_mean_square(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else float("nan")
 
 

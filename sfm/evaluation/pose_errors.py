@@ -61,7 +61,11 @@ def absolute_pose_errors(cams_from_world: Rigid3, true_cams_from_world: Rigid3) 
 
 
 def relative_pose_errors(
-    cams_from_world: Rigid3, true_cams_from_world: Rigid3, *, present: np.ndarray | None = None, min_baseline: float = 0
+    cams_from_world: Rigid3,
+    true_cams_from_world: Rigid3,
+    *,
+    present: np.ndarray | None = None,
+    min_baseline: float = 0.0,
 ) -> RelativePoseErrors:
     """Errors of the relative poses of all ordered pairs.
 
@@ -112,9 +116,7 @@ def angle_between(vectors1: FloatArray, vectors2: FloatArray) -> FloatArray:
     return np.where(lone_zero, np.pi / 2, angle)
 
 
-def trajectory_errors(
-    cams_from_world: Rigid3, true_cams_from_world: Rigid3, *, step: int = 1
-) -> tuple[Vector, Vector]:
+def trajectory_errors(cams_from_world: Rigid3, true_cams_from_world: Rigid3, *, step: int = 1) -> tuple[Vector, Vector]:
     """RPE: errors of the motions over `step` images of a sequence, in degrees and in scene units.
 
     The estimate must have the truth's scale (align it first).

@@ -1,1 +1,1 @@
-""""""
+"""Pictures and interactive views of a model."""

@@ -1,0 +1,1 @@
+"""Data sets for development; nothing that is installed imports them."""
