@@ -14,6 +14,7 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -116,7 +117,7 @@ def _full_from_reduced(full: np.ndarray, reduced: np.ndarray) -> tuple[float, fl
 
 
 def _features(
-    keypoints: tuple[cv2.KeyPoint, ...],
+    keypoints: Sequence[cv2.KeyPoint],
     histograms: Float32[np.ndarray, "N D"],
     full_from_reduced: tuple[float, float],
     limit: int,

@@ -10,7 +10,7 @@ from sfm.matching import MatchingConfig, exhaustive_pairs, match_features, neare
 
 def features_of(descriptors: np.ndarray) -> Features:
     n = len(descriptors)
-    return Features(np.zeros((n, 2)), np.zeros(n), np.zeros(n), descriptors.astype(np.uint8))
+    return Features(np.zeros((n, 2)), np.zeros(n, np.float32), np.zeros(n, np.float32), descriptors.astype(np.uint8))
 
 
 def related_descriptors(seed: int, count1: int, count2: int, shared: int) -> tuple[Features, Features]:
@@ -102,7 +102,7 @@ def test_descriptors_of_different_or_too_great_length_are_refused():
 
 @pytest.mark.parametrize("options", [{"max_ratio": 0.0}, {"max_ratio": 1.1}, {"max_distance": 0.0}])
 def test_settings_out_of_range_are_refused(options):
-    with pytest.raises(ConfigError, match="must be|above"):
+    with pytest.raises(ConfigError, match=r"must be|above"):
         MatchingConfig(**options)
 
 

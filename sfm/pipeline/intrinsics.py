@@ -1,0 +1,97 @@
+"""Given intrinsics: which camera of a file took which image, and cameras of a resized image.
+
+A file with one camera stands for all images. A file with several serves by size: an image takes the camera of its
+own size, or failing that the one whose size is a pure multiple of its own. Where several cameras fit alike, their
+number must be that of the images, and they are taken in order: camera ids ascending, image names sorted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from sfm.core.cameras import Camera
+from sfm.core.errors import ConfigError
+
+
+def assigned_cameras(
+    cameras: Mapping[int, Camera], images: Sequence[tuple[str, int, int]], path: str
+) -> dict[str, tuple[int, Camera]]:
+    """For each image its camera's id in the file, and the camera at the image's size.
+
+    Args:
+        cameras: by id, not empty.
+        images: name, width and height in px, sorted by name.
+        path: the file, for messages.
+    Raises:
+        ConfigError: no camera fits an image, or several do.
+    """
+    if len(cameras) == 1 or len(cameras) != len(images):
+        return {name: _by_size(cameras, name, width, height, path) for name, width, height in images}
+    in_order = zip(images, sorted(cameras.items()), strict=True)
+    return {
+        name: (camera_id, _resized(camera, name, width, height, path))
+        for (name, width, height), (camera_id, camera) in in_order
+    }
+
+
+def resized_camera(camera: Camera, width: int, height: int) -> Camera | None:
+    """The camera of images that were resized to `width` × `height` px as a whole; None where they cannot have been.
+
+    Focal length and principal point grow with the image, as pixel centres are at one half; distortion acts on
+    normalised coordinates and stays.
+    """
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    if not _is_multiple(camera, width, height):
+        return None
+    factors = width / camera.width, height / camera.height
+    params = camera.params.copy()
+    for k, name in enumerate(camera.model_info.param_names):
+        match name:
+            case "f":
+                params[k] *= np.mean(factors)
+            case "fx" | "cx" | "w":
+                params[k] *= factors[0]
+            case "fy" | "cy" | "h":
+                params[k] *= factors[1]
+    return dataclasses.replace(camera, width=width, height=height, params=params)
+
+
+def _is_multiple(camera: Camera, width: int, height: int) -> bool:
+    """Whether one factor, with each side rounded to whole px, leads from the camera's size to the image's."""
+    lowest = max((width - 1) / camera.width, (height - 1) / camera.height)
+    highest = min((width + 1) / camera.width, (height + 1) / camera.height)
+    return lowest < highest
+
+
+def _by_size(cameras: Mapping[int, Camera], name: str, width: int, height: int, path: str) -> tuple[int, Camera]:
+    exact = [(k, camera) for k, camera in cameras.items() if (camera.width, camera.height) == (width, height)]
+    fitting = exact or [(k, r) for k, camera in cameras.items() if (r := resized_camera(camera, width, height))]
+    if len(fitting) == 1:
+        return fitting[0]
+    if not fitting:
+        raise _no_camera(cameras.values(), name, width, height, path)
+    raise ConfigError(
+        f"{len(fitting)} of its {len(cameras)} cameras fit {name} of {width}×{height} px",
+        path=path,
+        remedy="give one camera, one for each image in the order of the names, or cameras of different sizes",
+    )
+
+
+def _resized(camera: Camera, name: str, width: int, height: int, path: str) -> Camera:
+    resized = resized_camera(camera, width, height)
+    if resized is None:
+        raise _no_camera([camera], name, width, height, path)
+    return resized
+
+
+def _no_camera(cameras: Iterable[Camera], name: str, width: int, height: int, path: str) -> ConfigError:
+    sizes = ", ".join(sorted({f"{camera.width}×{camera.height}" for camera in cameras}))
+    return ConfigError(
+        f"its intrinsics are for {sizes} px, but {name} has {width}×{height} px",
+        path=path,
+        remedy="intrinsics can be scaled, but not to another shape: give those of the uncropped, unrotated images",
+    )

@@ -1,0 +1,106 @@
+"""The last stage: models from the view graph, in colour, on disk."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+from sfm.core.events import Event, ImageRegistered, StageFinished, StageStarted
+from sfm.core.scene import Reconstruction
+from sfm.io.colmap_model import model_format, read_model, write_model
+from sfm.io.database import Decision
+from sfm.io.images import read_image
+from sfm.mapping import map_incrementally
+from sfm.pipeline.colors import colorize
+from sfm.pipeline.keys import code_digest, file_digest, key_of
+from sfm.pipeline.stages import Pair, Run
+
+STAGE = "mapping"
+
+
+def map_all(run: Run, pair_keys: Mapping[Pair, str], folder: Path) -> tuple[list[Reconstruction], str]:
+    """Models of all images that hang together, the largest first, written to `folder`/0 and so on; and their key."""
+    key = _key(run, pair_keys)
+    stored = run.database.stage_keys(STAGE)
+    if stored.get("models") == key and stored.get("files") == _files_key(folder):
+        models = _read_all(folder)
+        run.observer(StageStarted(stage=STAGE, cached=len(models)))
+    else:
+        run.database.clear_stage(STAGE)
+        run.observer(StageStarted(stage=STAGE, total=len(run.images)))
+        paths = {image.name: image.path for image in run.images.values()}
+        models = [colorize(model, lambda name: read_image(paths[name])) for model in _map(run)]
+        if models:
+            _write_all(models, folder)
+            run.database.set_stage_keys(STAGE, {"models": key, "files": _files_key(folder)})
+    sizes = ", ".join(str(len(model.image_ids)) for model in models) or "no"
+    run.observer(StageFinished(stage=STAGE, summary=f"{sizes} of {len(run.images)} images"))
+    return models, key
+
+
+def _map(run: Run) -> list[Reconstruction]:
+    database, config = run.database, run.config
+    counts = database.feature_counts()
+    used = {image_id: image for image_id, image in run.images.items() if counts.get(image_id)}
+    decisions: list[Decision] = []
+
+    def note(event: Event, /) -> None:
+        if isinstance(event, ImageRegistered):
+            verdict, threshold = event.reason or "registered", float(config.mapping.resection_min_inliers)
+            detail = f"{event.visible} points visible, {event.registered} images before"
+            decisions.append(Decision(STAGE, event.name, "inliers", float(event.inliers), threshold, verdict, detail))
+        run.observer(event)
+
+    models = map_incrementally(
+        database.read_view_graph(),
+        {image_id: database.read_keypoints(image_id) for image_id in used},
+        {image.camera_id: image.camera for image in used.values()},
+        {image_id: image.camera_id for image_id, image in used.items()},
+        {image_id: image.name for image_id, image in used.items()},
+        config.mapping,
+        seed=config.seed,
+        threads=run.threads,
+        refine_intrinsics=refines_intrinsics(run),
+        observer=note,
+    )
+    with database.transaction():
+        database.clear_ledger(STAGE)
+        database.record(*decisions)
+    return models
+
+
+def refines_intrinsics(run: Run) -> bool:
+    """Given intrinsics are held fixed unless the user says otherwise."""
+    cameras = run.config.cameras
+    return cameras.refine_intrinsics or not cameras.intrinsics
+
+
+def _key(run: Run, pair_keys: Mapping[Pair, str]) -> str:
+    code = code_digest("sfm.mapping", "sfm.bundle", "sfm.core")
+    images = [[k, image.name, image.digest, image.camera_id, image.camera] for k, image in sorted(run.images.items())]
+    pairs = [[*pair, key] for pair, key in sorted(pair_keys.items())]
+    return key_of(code, run.config.mapping, run.config.seed, refines_intrinsics(run), images, pairs)
+
+
+def _model_folders(folder: Path) -> list[Path]:
+    """The folders 0, 1, … without a gap."""
+    return list(itertools.takewhile(model_format, (folder / str(k) for k in itertools.count())))
+
+
+def _files_key(folder: Path) -> str:
+    files = [path for model in _model_folders(folder) for path in sorted(model.glob("*.bin"))]
+    return key_of([[path.relative_to(folder).as_posix(), file_digest(path)] for path in files])
+
+
+def _read_all(folder: Path) -> list[Reconstruction]:
+    return [read_model(path) for path in _model_folders(folder)]
+
+
+def _write_all(models: list[Reconstruction], folder: Path) -> None:
+    obsolete = _model_folders(folder)[len(models) :]
+    for k, model in enumerate(models):
+        write_model(model, folder / str(k))
+    for path in obsolete:
+        shutil.rmtree(path)

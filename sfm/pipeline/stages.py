@@ -1,0 +1,239 @@
+"""The stages over all images and pairs, each item once: computed on several threads, kept as it comes.
+
+One thread writes. Items are computed out of order, but written in theirs, a transaction about every second; a run that
+is killed loses that second. What carries the key of its inputs is not computed again (see `keys`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from sfm.core.cameras import Camera
+from sfm.core.errors import ImageError, Rejected
+from sfm.core.events import FeaturesExtracted, Observer, PairMatched, PairVerified, StageFinished, StageStarted
+from sfm.core.execution import ordered_map
+from sfm.core.scene import Features, Matches, TwoViewGeometry
+from sfm.features import extract_features
+from sfm.features.sift import working_memory_bytes
+from sfm.io.database import Database, Decision
+from sfm.io.images import read_image
+from sfm.matching import exhaustive_pairs, match_features
+from sfm.pipeline.config import PipelineConfig
+from sfm.pipeline.keys import code_digest, key_of
+from sfm.pipeline.memory import free_memory_bytes
+from sfm.verification import verify_pair
+
+_COMMIT_EVERY_S = 1.0
+_CACHED_IMAGES = 256
+"""Features held in memory, about 1.3 MB an image."""
+_TILE = _CACHED_IMAGES // 2
+"""Pairs are visited tile by tile, so that both sides of a tile fit into the cache."""
+
+_MEMORY_GUESS_BYTES = 8 * 1024**3
+
+Pair = tuple[int, int]
+Result = TypeVar("Result")
+Item = TypeVar("Item", int, Pair)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SceneImage:
+    """An image of the run: its row in the database, its file and what stands for its content."""
+
+    image_id: int
+    name: str
+    path: Path
+    digest: str
+    camera_id: int
+    camera: Camera
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Run:
+    """What every stage needs."""
+
+    database: Database
+    config: PipelineConfig
+    threads: int
+    observer: Observer
+    images: Mapping[int, SceneImage]
+
+    def pair_names(self, pair: Pair) -> tuple[str, str]:
+        """The names of the two images."""
+        return self.images[pair[0]].name, self.images[pair[1]].name
+
+
+def extract_all(run: Run) -> dict[int, str]:
+    """Features of all images; returns the key of each."""
+    stage, config = "features", run.config.features
+    basis = key_of(code_digest("sfm.features"), cv2.__version__, config)
+    keys = {image_id: key_of(basis, image.digest) for image_id, image in run.images.items()}
+    counts = run.database.feature_counts()
+    stale = _stale(run, stage, keys, present=counts)
+    threads = _threads_that_fit(run, stale)
+
+    def compute(image_id: int) -> tuple[int, Features | Rejected]:
+        return image_id, _extract(run.images[image_id], run.config)
+
+    def write(result: tuple[int, Features | Rejected]) -> None:
+        image_id, features = result
+        name = run.images[image_id].name
+        rejected = isinstance(features, Rejected)
+        count = 0 if rejected else len(features)
+        run.database.write_features(image_id, _no_features() if rejected else features)
+        run.database.clear_ledger(stage, [name])
+        verdict, detail = (features.reason, features.detail) if rejected else ("kept", "")
+        run.database.record(Decision(stage, name, "keypoints", float(count), 1.0, verdict, detail))
+        run.database.set_stage_keys(stage, {_label(image_id): keys[image_id]})
+        run.observer(FeaturesExtracted(name=name, count=count))
+
+    run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
+    _keep_as_they_come(run.database, ordered_map(compute, stale, threads=threads), write)
+    counts = run.database.feature_counts()
+    mean = np.mean([counts[image_id] for image_id in keys]) if keys else 0
+    run.observer(StageFinished(stage=stage, summary=f"{len(keys)} images, {mean:.0f} keypoints each"))
+    return keys
+
+
+def match_all(run: Run, feature_keys: Mapping[int, str]) -> dict[Pair, str]:
+    """Putative matches of all pairs of images that have features; returns the key of each pair."""
+    stage, config = "matching", run.config.matching
+    basis = key_of(code_digest("sfm.matching"), config)
+    counts = run.database.feature_counts()
+    pairs = exhaustive_pairs(image_id for image_id in run.images if counts.get(image_id))
+    keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}
+    stale = _stale(run, stage, keys, present=run.database.matched_pairs())
+    features = lru_cache(_CACHED_IMAGES)(run.database.read_features)
+
+    def inputs() -> Iterator[tuple[Pair, Features, Features]]:
+        for i, j in _tiled(stale):
+            yield (i, j), features(i), features(j)
+
+    def compute(item: tuple[Pair, Features, Features]) -> tuple[Pair, Matches]:
+        pair, features1, features2 = item
+        return pair, match_features(features1, features2, config)
+
+    def write(result: tuple[Pair, Matches]) -> None:
+        pair, matches = result
+        name1, name2 = run.pair_names(pair)
+        run.database.write_matches(*pair, matches)
+        run.database.set_stage_keys(stage, {_label(pair): keys[pair]})
+        run.observer(PairMatched(name1=name1, name2=name2, count=len(matches)))
+
+    run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
+    _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
+    _forget_other_pairs(run, stage, keys)
+    median = np.median(list(run.database.match_counts().values())) if keys else 0
+    run.observer(StageFinished(stage=stage, summary=f"{len(keys)} pairs, {median:.0f} matches in the median"))
+    return keys
+
+
+def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
+    """Two-view geometry of all matched pairs; returns the key of each pair."""
+    stage, config, seed = "verification", run.config.verification, run.config.seed
+    basis = key_of(code_digest("sfm.verification", "sfm.core"), config, seed)
+    camera_keys = {image.camera_id: key_of(image.camera) for image in run.images.values()}
+    keys = {
+        (i, j): key_of(basis, i, j, key, *(camera_keys[run.images[k].camera_id] for k in (i, j)))
+        for (i, j), key in match_keys.items()
+    }
+    stale = _stale(run, stage, keys, present=run.database.verified_pairs())
+    points2D = lru_cache(_CACHED_IMAGES)(run.database.read_keypoints)
+
+    def inputs() -> Iterator[tuple[Pair, np.ndarray, np.ndarray, Matches]]:
+        for i, j in _tiled(stale):
+            yield (i, j), points2D(i), points2D(j), run.database.read_matches(i, j)
+
+    def compute(item: tuple[Pair, np.ndarray, np.ndarray, Matches]) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
+        pair, points2D_1, points2D_2, matches = item
+        camera1, camera2 = run.images[pair[0]].camera, run.images[pair[1]].camera
+        rng = np.random.default_rng([seed, *pair])
+        return pair, len(matches), verify_pair(points2D_1, points2D_2, matches, camera1, camera2, config, rng=rng)
+
+    def write(result: tuple[Pair, int, TwoViewGeometry | Rejected]) -> None:
+        pair, matches, geometry = result
+        name1, name2 = run.pair_names(pair)
+        run.database.write_geometry(*pair, geometry)
+        run.database.set_stage_keys(stage, {_label(pair): keys[pair]})
+        if isinstance(geometry, Rejected):
+            inliers, kind, reason = 0, "", geometry.reason
+        else:
+            inliers, kind, reason = len(geometry), geometry.kind.name.lower(), ""
+        run.observer(PairVerified(name1=name1, name2=name2, matches=matches, inliers=inliers, kind=kind, reason=reason))
+
+    run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
+    _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
+    _forget_other_pairs(run, stage, keys)
+    rejected = len(run.database.rejected_pairs())
+    run.observer(StageFinished(stage=stage, summary=f"{len(keys) - rejected} of {len(keys)} pairs"))
+    return keys
+
+
+def _extract(image: SceneImage, config: PipelineConfig) -> Features | Rejected:
+    try:
+        grey = read_image(image.path, gray=True)
+    except ImageError as error:
+        return Rejected("unreadable", error.cause)
+    return extract_features(grey, config.features)
+
+
+def _no_features() -> Features:
+    nothing = np.zeros(0, np.float32)
+    return Features(np.zeros((0, 2)), nothing, nothing, np.zeros((0, 128), np.uint8))
+
+
+def _threads_that_fit(run: Run, image_ids: Iterable[int]) -> int:
+    """As many images at once as threads are there and half of the free memory holds."""
+    config = run.config.features
+    needs = [working_memory_bytes(run.images[k].camera.width, run.images[k].camera.height, config) for k in image_ids]
+    free = free_memory_bytes() or _MEMORY_GUESS_BYTES
+    return int(np.clip(free // (2 * max(needs, default=1)), 1, run.threads))
+
+
+def _keep_as_they_come(database: Database, results: Iterator[Result], write: Callable[[Result], None]) -> None:
+    """Writes each result, in transactions of about a second."""
+    more = True
+    while more:
+        more = False
+        with database.transaction():
+            until = time.monotonic() + _COMMIT_EVERY_S
+            for result in results:
+                write(result)
+                if time.monotonic() >= until:
+                    more = True
+                    break
+
+
+def _label(item: int | Pair) -> str:
+    """How an item of a stage is called in the database."""
+    return str(item) if isinstance(item, int) else f"{item[0]}-{item[1]}"
+
+
+def _stale(run: Run, stage: str, keys: Mapping[Item, str], present: Iterable[Item]) -> list[Item]:
+    """The items that must be computed: their key is another, or their result is gone."""
+    stored, present = run.database.stage_keys(stage), set(present)
+    return [item for item, key in keys.items() if stored.get(_label(item)) != key or item not in present]
+
+
+def _tiled(pairs: Iterable[Pair]) -> list[Pair]:
+    return sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
+
+
+def _forget_other_pairs(run: Run, stage: str, keys: Mapping[Pair, str]) -> None:
+    """Drops results of pairs that are no longer wanted."""
+    wanted = {_label(pair) for pair in keys}
+    clear = run.database.clear_matches if stage == "matching" else run.database.clear_geometries
+    present = run.database.matched_pairs() if stage == "matching" else run.database.verified_pairs()
+    with run.database.transaction():
+        run.database.clear_stage(stage, [label for label in run.database.stage_keys(stage) if label not in wanted])
+        for pair in present:
+            if pair not in keys:
+                clear(pair)
