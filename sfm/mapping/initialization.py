@@ -30,15 +30,17 @@ class InitialPair:
 
 
 _GOOD_ANGLE = np.deg2rad(16.0)
+_GUESSED_PLANE_TRUST = 0.01
 
 
 def rank_initial_pairs(state: State, view_graph: ViewGraph) -> list[InitialPair]:
     """Candidates among unregistered images, the most promising first.
 
-    The rank is the number of matches, scaled down where the angle is below 16° or a focal length is only a guess.
+    The rank is the number of matches, scaled down where the angle is below 16° or a focal length is only a guess. A
+    plane under guessed focal lengths comes last: its pose is only as good as the guess.
     """
     row = {image_id: k for k, image_id in enumerate(state.scene.image_ids.tolist())}
-    ranked = []
+    ranked: list[tuple[float, int, int, InitialPair]] = []
     for (i, j), geometry in view_graph.pairs.items():
         image1, image2 = row[i], row[j]
         if geometry.cam2_from_cam1 is None or geometry.kind in (PairKind.PANORAMIC, PairKind.WATERMARK):
@@ -47,7 +49,8 @@ def rank_initial_pairs(state: State, view_graph: ViewGraph) -> list[InitialPair]
             continue
         pair = _measure(state, image1, image2, geometry.matches, geometry.cam2_from_cam1)
         known = [state.scene.cameras[state.scene.image_camera[k]].has_prior_focal_length for k in (image1, image2)]
-        score = pair.inliers * min(1.0, pair.angle / _GOOD_ANGLE) * 0.5 ** (2 - sum(known))
+        trust = 0.5 ** (2 - sum(known)) if geometry.kind != PairKind.PLANAR or all(known) else _GUESSED_PLANE_TRUST
+        score = pair.inliers * min(1.0, pair.angle / _GOOD_ANGLE) * trust
         ranked.append((-score, i, j, pair))
     return [pair for *_, pair in sorted(ranked, key=lambda entry: entry[:3])]
 

@@ -1,0 +1,184 @@
+"""Focal lengths from fundamental matrices.
+
+With the principal points known, F between images i and j and the true focal lengths give E = Kjᵀ F Ki, whose singular
+values are (s, s, 0). Away from them the first two differ, and
+
+    r(fi, fj) = (s₁² − s₂²) / (s₁² + s₂²)        in [0, 1), 0 for an essential matrix
+
+measures by how much. One pair seldom fixes two focal lengths; all pairs of an image together do. The sum over pairs
+
+    Σ w log(1 + (r / c)²)  +  Σ (log f/f₀)² / 2σ²
+
+has many local minima in log f, so each unknown focal length in turn is moved to its best on a grid, until none moves,
+and then within ever finer neighbourhoods. A camera that the pairs leave undetermined
+stays at its guess f₀, held by the second term.
+
+References:
+    Sweeney, Kneip, Höllerer & Turk, Computing similarity transformations from only image correspondences /
+    Large scale SfM with the distributed camera model (view-graph calibration), ICCV 2015.
+    Fetzer, Reis & Stricker, Stable intrinsic auto-calibration from fundamental matrices, WACV 2020.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+
+from sfm.core.arrays import FloatArray, Points2D
+from sfm.core.cameras import Camera
+from sfm.core.geometry.epipolar import essential_from_fundamental, pose_from_essential
+from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
+
+_SWEEPS = 20
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class FocalConfig:
+    """How unknown focal lengths are estimated."""
+
+    min_factor: float = 0.3
+    """Smallest focal length, as a multiple of the guess of 1.2 × the longer side: 150° of view."""
+    max_factor: float = 4.0
+    """Largest focal length, likewise: 12° of view."""
+    residual_scale: float = 0.03
+    """Disagreement c of a pair from which it counts less: noise of F on real photos."""
+    log_sigma: float = 0.7
+    """Trust in the guess: the standard deviation of log f, about a factor of two."""
+    full_weight_inliers: int = 100
+    """Pairs with fewer inliers count in proportion: their F is less certain."""
+
+
+def calibrate_focal_lengths(
+    view_graph: ViewGraph,
+    cameras: Mapping[int, Camera],
+    image_cameras: Mapping[int, int],
+    config: FocalConfig = FocalConfig(),
+) -> dict[int, Camera]:
+    """The cameras, with better focal lengths for those that have none from EXIF or calibration.
+
+    Only perspective cameras, and pairs with a fundamental matrix, take part; pairs of two known cameras change
+    nothing. The result does not depend on the order of the pairs.
+    """
+    pairs = [
+        (image_cameras[i], image_cameras[j], geometry)
+        for (i, j), geometry in view_graph.pairs.items()
+        if geometry.kind in (PairKind.UNCALIBRATED, PairKind.CALIBRATED) and geometry.F is not None
+    ]
+    pairs = [p for p in pairs if not any(cameras[c].model_info.is_fisheye for c in p[:2])]
+    unknown = sorted({c for p in pairs for c in p[:2] if not cameras[c].has_prior_focal_length})
+    if not unknown:
+        return dict(cameras)
+    log_factor = _search(_Terms.build(pairs, cameras, unknown, config), len(unknown), config)
+    return dict(cameras) | {c: _scaled_focal(cameras[c], np.exp(x)) for c, x in zip(unknown, log_factor, strict=True)}
+
+
+def poses_under(
+    view_graph: ViewGraph,
+    keypoints: Mapping[int, Points2D],
+    cameras: Mapping[int, Camera],
+    image_cameras: Mapping[int, int],
+) -> ViewGraph:
+    """The view graph with the relative poses of uncalibrated pairs taken from F and these cameras."""
+    pairs = dict(view_graph.pairs)
+    for (i, j), geometry in view_graph.pairs.items():
+        if geometry.kind == PairKind.UNCALIBRATED and geometry.F is not None:
+            points = keypoints[i][geometry.matches[:, 0]], keypoints[j][geometry.matches[:, 1]]
+            pairs[i, j] = _posed(geometry, points, cameras[image_cameras[i]], cameras[image_cameras[j]])
+    return ViewGraph(pairs)
+
+
+def _posed(
+    geometry: TwoViewGeometry, points: tuple[Points2D, Points2D], camera1: Camera, camera2: Camera
+) -> TwoViewGeometry:
+    (rays1, valid1), (rays2, valid2) = camera1.unproject(points[0]), camera2.unproject(points[1])
+    valid = valid1 & valid2
+    if geometry.F is None or not valid.any():
+        return geometry
+    essential = essential_from_fundamental(geometry.F, camera1.calibration_matrix, camera2.calibration_matrix)
+    pose, _ = pose_from_essential(essential, rays1[valid], rays2[valid])
+    turned = pose.rotation @ rays1[valid]
+    sine = np.linalg.norm(np.cross(turned, rays2[valid]), axis=1)
+    angles = np.arctan2(sine, np.einsum("ni,ni->n", turned, rays2[valid]))
+    return dataclasses.replace(geometry, cam2_from_cam1=pose, tri_angle=float(np.median(angles)))
+
+
+def _scaled_focal(camera: Camera, factor: float) -> Camera:
+    params = camera.params.copy()
+    params[list(camera.model_info.focal_indices)] *= factor
+    return dataclasses.replace(camera, params=params)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Terms:
+    """Pairs in columns: E at the guessed focal lengths, the rows of their unknown focal lengths (−1: known), weights."""
+
+    essential: FloatArray
+    first: np.ndarray
+    second: np.ndarray
+    weight: FloatArray
+    config: FocalConfig
+
+    @staticmethod
+    def build(
+        pairs: list[tuple[int, int, TwoViewGeometry]],
+        cameras: Mapping[int, Camera],
+        unknown: list[int],
+        config: FocalConfig,
+    ) -> _Terms:
+        row = {camera_id: k for k, camera_id in enumerate(unknown)}
+        used = [(c1, c2, g) for c1, c2, g in pairs if c1 in row or c2 in row]
+        essential = [
+            cameras[c2].calibration_matrix.T @ g.F @ cameras[c1].calibration_matrix
+            for c1, c2, g in used
+            if g.F is not None
+        ]
+        return _Terms(
+            np.array(essential),
+            np.array([row.get(c1, -1) for c1, _, _ in used]),
+            np.array([row.get(c2, -1) for _, c2, _ in used]),
+            np.array([min(1.0, len(g) / config.full_weight_inliers) for *_, g in used]),
+            config,
+        )
+
+    def costs(self, rows: np.ndarray, first: FloatArray, second: FloatArray) -> FloatArray:
+        """Cost (n, G) of pairs `rows` (n,) at log factors `first` and `second` (n, G); the singular values in closed
+        form: s₁² and s₂² are the roots of λ² − aλ + b, a = tr EᵀE, b the second invariant (s₃ = 0)."""
+        one, two = np.ones_like(first), np.ones_like(second)
+        left = np.stack([np.exp(second), np.exp(second), two], -1)
+        right = np.stack([np.exp(first), np.exp(first), one], -1)
+        E = left[..., :, None] * self.essential[rows][:, None] * right[..., None, :]
+        gram = np.swapaxes(E, -1, -2) @ E
+        a = np.trace(gram, axis1=-2, axis2=-1)
+        b = 0.5 * (a**2 - np.einsum("...ij,...ij->...", gram, gram))
+        squared = np.clip(1 - 4 * b / a**2, 0.0, 1.0)
+        return self.weight[rows][:, None] * np.log1p(squared / self.config.residual_scale**2)
+
+    def camera_cost(self, camera: int, tried: FloatArray, log_factor: FloatArray) -> FloatArray:
+        """Cost (G,) of all pairs of an unknown camera at log factors `tried` (G,), the others as they are."""
+        rows = np.flatnonzero((self.first == camera) | (self.second == camera))
+        known = np.append(log_factor, 0.0)  # row −1: a known focal length is not scaled
+        first = np.where((self.first[rows] == camera)[:, None], tried, known[self.first[rows]][:, None])
+        second = np.where((self.second[rows] == camera)[:, None], tried, known[self.second[rows]][:, None])
+        return self.costs(rows, first, second).sum(0) + 0.5 * (tried / self.config.log_sigma) ** 2
+
+
+def _search(terms: _Terms, count: int, config: FocalConfig) -> FloatArray:
+    """Log factors (count,) by coordinate descent on a grid, then on ever finer neighbourhoods."""
+    x = np.zeros(count)
+    grid = np.linspace(np.log(config.min_factor), np.log(config.max_factor), 61)
+    order = np.argsort([-np.sum((terms.first == c) | (terms.second == c)) for c in range(count)], kind="stable")
+    for _ in range(_SWEEPS):
+        before = x.copy()
+        for c in order.tolist():
+            x[c] = grid[np.argmin(terms.camera_cost(c, grid, x))]
+        if np.array_equal(x, before):
+            break
+    step = grid[1] - grid[0]
+    while step > 1e-4:
+        for c in order.tolist():
+            near = x[c] + step * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+            x[c] = near[np.argmin(terms.camera_cost(c, near, x))]
+        step *= 0.7
+    return x

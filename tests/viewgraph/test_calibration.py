@@ -1,0 +1,81 @@
+import numpy as np
+import pytest
+
+from sfm.core.cameras import Camera
+from sfm.core.geometry.epipolar import essential_from_pose, fundamental_from_essential
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
+from sfm.viewgraph import calibrate_focal_lengths, poses_under
+
+TRUE_FOCALS = {1: 700.0, 2: 1100.0, 3: 900.0, 4: 1500.0, 5: 1250.0}
+
+
+def _camera(focal, known=False):
+    return Camera("SIMPLE_RADIAL", 1000, 750, np.array([focal, 500, 375, 0.0]), known)
+
+
+def _scene(rng):
+    """Five cameras in general position round a cloud: keypoints, and F of every pair."""
+    points = rng.uniform(-1, 1, (200, 3))
+    poses = {}
+    for i in TRUE_FOCALS:
+        angle = 0.3 * i
+        turn = Rotation3.exp(np.array([0.2 * np.sin(i), angle, 0.1 * np.cos(2 * i)]))
+        offset = np.array([0.1 * i, -0.2 * np.sin(i), 6 + 0.4 * np.cos(3 * i)])
+        poses[i] = Rigid3(turn, offset)
+    truth = {i: _camera(f) for i, f in TRUE_FOCALS.items()}
+    keypoints = {i: truth[i].project(poses[i] @ points)[0] for i in truth}
+    pairs = {}
+    for i in truth:
+        for j in range(i + 1, len(truth) + 1):
+            essential = essential_from_pose(poses[j] @ poses[i].inverse())
+            F = fundamental_from_essential(essential, truth[i].calibration_matrix, truth[j].calibration_matrix)
+            F = F / np.linalg.norm(F)
+            matches = np.repeat(np.arange(200, dtype=np.int32)[:, None], 2, 1)
+            pairs[i, j] = TwoViewGeometry(PairKind.UNCALIBRATED, matches, F=F)
+    return ViewGraph(pairs), keypoints, poses
+
+
+def test_exact_matrices_give_exact_focal_lengths(rng):
+    graph, _, _ = _scene(rng)
+    found = calibrate_focal_lengths(graph, {i: _camera(1200.0) for i in TRUE_FOCALS}, {i: i for i in TRUE_FOCALS})
+    for i, focal in TRUE_FOCALS.items():
+        assert found[i].mean_focal_length == pytest.approx(focal, rel=5e-3)
+
+
+def test_a_known_focal_length_is_not_touched(rng):
+    graph, _, _ = _scene(rng)
+    cameras = {i: _camera(TRUE_FOCALS[i] if i == 2 else 1200.0, known=i == 2) for i in TRUE_FOCALS}
+    found = calibrate_focal_lengths(graph, cameras, {i: i for i in TRUE_FOCALS})
+    assert found[2] is cameras[2]
+
+
+def test_one_wrong_pair_does_not_move_the_others(rng):
+    graph, _, _ = _scene(rng)
+    pairs = dict(graph.pairs)
+    pairs[1, 2] = TwoViewGeometry(PairKind.UNCALIBRATED, pairs[1, 2].matches, F=rng.normal(size=(3, 3)))
+    found = calibrate_focal_lengths(
+        ViewGraph(pairs), {i: _camera(1200.0) for i in TRUE_FOCALS}, {i: i for i in TRUE_FOCALS}
+    )
+    for i, focal in TRUE_FOCALS.items():
+        assert found[i].mean_focal_length == pytest.approx(focal, rel=0.03)
+
+
+def test_pairs_without_a_matrix_leave_the_guess():
+    graph = ViewGraph({(1, 2): TwoViewGeometry(PairKind.PLANAR, np.zeros((50, 2), np.int32))})
+    cameras = {1: _camera(1200.0), 2: _camera(1200.0)}
+    assert calibrate_focal_lengths(graph, cameras, {1: 1, 2: 2}) == cameras
+
+
+def test_poses_follow_the_corrected_focal_lengths(rng):
+    graph, keypoints, poses = _scene(rng)
+    truth = {i: _camera(f) for i, f in TRUE_FOCALS.items()}
+    posed = poses_under(graph, keypoints, truth, {i: i for i in TRUE_FOCALS})
+    for (i, j), geometry in posed.pairs.items():
+        motion = poses[j] @ poses[i].inverse()
+        assert geometry.cam2_from_cam1 is not None
+        assert (geometry.cam2_from_cam1.rotation @ motion.rotation.inverse()).angle < 1e-6
+        direction = motion.translation / np.linalg.norm(motion.translation)
+        assert np.abs(geometry.cam2_from_cam1.translation - direction).max() < 1e-6
+        assert geometry.tri_angle > 0.01
