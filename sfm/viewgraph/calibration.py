@@ -9,9 +9,10 @@ measures by how much. One pair seldom fixes two focal lengths; all pairs of an i
 
     Σ w log(1 + (r / c)²)  +  Σ (log f/f₀)² / 2σ²
 
-has many local minima in log f, so each unknown focal length in turn is moved to its best on a grid, until none moves,
-and then within ever finer neighbourhoods. A camera that the pairs leave undetermined
-stays at its guess f₀, held by the second term.
+has many local minima in log f, so each unknown focal length in turn is moved to its best on a grid, until none moves;
+from there a quasi-Newton method follows the long valleys that coordinates cannot. A camera that the pairs leave
+undetermined stays at its guess f₀, held by the second term; it biases the others by a percent or two, which
+adjustment mends.
 
 References:
     Sweeney, Kneip, Höllerer & Turk, Computing similarity transformations from only image correspondences /
@@ -25,6 +26,7 @@ import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.optimize import minimize
 
 from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
@@ -32,6 +34,8 @@ from sfm.core.geometry.epipolar import essential_from_fundamental, pose_from_ess
 from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
 
 _SWEEPS = 20
+_STEP = 1e-5
+"""Of the central differences, in log f."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,9 +167,25 @@ class _Terms:
         second = np.where((self.second[rows] == camera)[:, None], tried, known[self.second[rows]][:, None])
         return self.costs(rows, first, second).sum(0) + 0.5 * (tried / self.config.log_sigma) ** 2
 
+    def total_cost(self, log_factor: FloatArray) -> float:
+        """Cost of all pairs and guesses."""
+        known = np.append(log_factor, 0.0)
+        rows = np.arange(len(self.weight))
+        pairs = self.costs(rows, known[self.first][:, None], known[self.second][:, None]).sum()
+        return float(pairs + 0.5 * np.sum((log_factor / self.config.log_sigma) ** 2))
+
+    def gradient(self, log_factor: FloatArray) -> FloatArray:
+        """Of `total_cost`, by central differences: each log factor is in few pairs."""
+        return np.array(
+            [
+                np.diff(self.camera_cost(c, x + _STEP * np.array([-1.0, 1.0]), log_factor))[0] / (2 * _STEP)
+                for c, x in enumerate(log_factor)
+            ]
+        )
+
 
 def _search(terms: _Terms, count: int, config: FocalConfig) -> FloatArray:
-    """Log factors (count,) by coordinate descent on a grid, then on ever finer neighbourhoods."""
+    """Log factors (count,) by coordinate descent on a grid, then by a quasi-Newton method from there."""
     x = np.zeros(count)
     grid = np.linspace(np.log(config.min_factor), np.log(config.max_factor), 61)
     order = np.argsort([-np.sum((terms.first == c) | (terms.second == c)) for c in range(count)], kind="stable")
@@ -175,10 +195,4 @@ def _search(terms: _Terms, count: int, config: FocalConfig) -> FloatArray:
             x[c] = grid[np.argmin(terms.camera_cost(c, grid, x))]
         if np.array_equal(x, before):
             break
-    step = grid[1] - grid[0]
-    while step > 1e-4:
-        for c in order.tolist():
-            near = x[c] + step * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
-            x[c] = near[np.argmin(terms.camera_cost(c, near, x))]
-        step *= 0.7
-    return x
+    return minimize(terms.total_cost, x, jac=terms.gradient, method="L-BFGS-B").x
