@@ -1,0 +1,267 @@
+"""Two-view geometry of matched images: which model explains the matches, and which of them are inliers.
+
+With I_E, I_F, I_H the inliers of the essential matrix, the fundamental matrix and a homography at one px threshold:
+
+    both focal lengths known     I_E ≥ 0.95 I_F    CALIBRATED, else UNCALIBRATED: the calibration must be wrong
+    otherwise                                      UNCALIBRATED
+    then                         I_H > 0.8 I       PANORAMIC if a rotation alone explains the matches, else PLANAR
+    then                         WATERMARK if the inliers are a translation of things at the border
+
+F and H live on the pixels of undistorted pinhole cameras with the given focal lengths and principal points, which are
+the pixels themselves for cameras without distortion. Fisheye and omnidirectional cameras have no such pixels: they
+are always treated as calibrated, and are panoramic by the rotation test alone.
+
+The poses of uncalibrated pairs come from E = K2ᵀ F K1 with the guessed focal lengths: good enough to begin with.
+
+Sampling of F and of H stops early where they can no longer change the decision.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from sfm.core.arrays import Mask, Matrix3, Points2D
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.events import SILENT, Observer, PairVerified
+from sfm.core.execution import ordered_map
+from sfm.core.geometry.epipolar import essential_from_fundamental, essential_from_pose, pose_from_essential
+from sfm.core.geometry.homography import decompose_homography
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.robust.fundamental import MatrixEstimate
+from sfm.core.robust.ransac import RansacConfig, polish
+from sfm.core.robust.relative_pose import (
+    essential_problem,
+    relative_pose_of_bearings,
+    scatter,
+)
+from sfm.core.scene import Matches, PairKind, TwoViewGeometry
+from sfm.verification.matched_pair import MatchedPair
+from sfm.verification.rotation_only import fit_rotation
+from sfm.verification.watermark import is_watermark
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VerificationConfig:
+    """What counts as a verified pair."""
+
+    ransac: RansacConfig = dataclasses.field(default_factory=RansacConfig)
+    """Threshold, confidence and limits of the sampling, and the fewest inliers."""
+    trust_focal: bool = False
+    """Treat every camera as calibrated, also those whose focal length is only a guess."""
+    min_calibrated_ratio: float = 0.95
+    """A pair is calibrated if E keeps this fraction of the inliers of F, which has two more degrees of freedom."""
+    max_homography_ratio: float = 0.8
+    """A homography that explains more than this fraction of the inliers means a plane or a rotation."""
+    min_rotation_ratio: float = 0.9
+    """A pair is panoramic if a rotation alone explains this fraction of the inliers."""
+    detect_watermark: bool = True
+    """Look for matches between watermarks, frames and time stamps."""
+    watermark_border: float = 0.1
+    """Width of the border in which watermarks are looked for, as a fraction of the image diagonal."""
+    min_watermark_ratio: float = 0.7
+    """Fraction of the inliers that must lie in the border, and of these that must share one translation."""
+
+
+def verify_pair(
+    points2D_1: Points2D,
+    points2D_2: Points2D,
+    matches: Matches,
+    camera1: Camera,
+    camera2: Camera,
+    config: VerificationConfig = VerificationConfig(),
+    *,
+    rng: np.random.Generator,
+) -> TwoViewGeometry | Rejected:
+    """The geometry that explains the matches of two images, with its inliers; see the module for the rule.
+
+    Args:
+        points2D_1, points2D_2: all keypoints of the images, px; `matches` are rows of them.
+    Returns:
+        The pose has a translation of unit length (zero if panoramic); its matches are those of the winning model.
+    Raises:
+        IndexError: a match names a keypoint that does not exist.
+    """
+    if len(matches) < config.ransac.min_inliers:
+        return Rejected("too_few_matches", f"{len(matches)} of {config.ransac.min_inliers} needed")
+    points1, points2 = points2D_1[matches.indices[:, 0]], points2D_2[matches.indices[:, 1]]
+    pair = MatchedPair(points1, points2, camera1, camera2, config.ransac, trust_focal=config.trust_focal, rng=rng)
+    found = _classify(pair, config)
+    if isinstance(found, Rejected):
+        return found
+    geometry, inliers = found
+    if config.detect_watermark and is_watermark(
+        *(points1[inliers], points2[inliers], camera1, camera2),
+        border=config.watermark_border,
+        min_ratio=config.min_watermark_ratio,
+        max_error_px=config.ransac.max_error_px,
+    ):
+        geometry = TwoViewGeometry(PairKind.WATERMARK, geometry.matches)
+    return dataclasses.replace(geometry, matches=matches.indices[inliers])
+
+
+def verify_pairs(
+    keypoints: Mapping[int, Points2D],
+    cameras: Mapping[int, Camera],
+    matches: Mapping[tuple[int, int], Matches],
+    config: VerificationConfig = VerificationConfig(),
+    *,
+    seed: int,
+    threads: int = 1,
+    names: Mapping[int, str] | None = None,
+    observer: Observer = SILENT,
+) -> Iterator[tuple[tuple[int, int], TwoViewGeometry | Rejected]]:
+    """`verify_pair` of every pair, in the order of `matches`; the results do not depend on `threads`.
+
+    Args:
+        keypoints, cameras, names: by image id.
+    """
+
+    def verify(pair: tuple[int, int]) -> TwoViewGeometry | Rejected:
+        i, j = pair
+        rng = np.random.default_rng([seed, i, j])
+        return verify_pair(keypoints[i], keypoints[j], matches[pair], cameras[i], cameras[j], config, rng=rng)
+
+    pairs = list(matches)
+    for pair, geometry in zip(pairs, ordered_map(verify, pairs, threads=threads), strict=True):
+        name1, name2 = (names[k] if names else str(k) for k in pair)
+        accepted = isinstance(geometry, TwoViewGeometry)
+        observer(
+            PairVerified(
+                name1=name1,
+                name2=name2,
+                matches=len(matches[pair]),
+                inliers=len(geometry) if accepted else 0,
+                kind=geometry.kind.name.lower() if accepted else "",
+                reason="" if accepted else geometry.reason,
+            )
+        )
+        yield pair, geometry
+
+
+def _classify(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeometry, Mask] | Rejected:
+    """Geometry, with its matches yet to be filled in, and the inlier mask."""
+    found = _calibrated(pair, config) if pair.calibrated else _uncalibrated(pair, config)
+    if isinstance(found, Rejected):
+        return found
+    geometry, inliers = found
+    needed = config.ransac.min_inlier_ratio * pair.count
+    if inliers.sum() < needed:
+        return Rejected("low_inlier_ratio", f"{inliers.sum() / pair.count:.2f}")
+    homography = None
+    if pair.perspective:
+        enough = config.max_homography_ratio * inliers.sum()
+        estimate = pair.homography(pair.limited(4, enough))
+        if isinstance(estimate, MatrixEstimate) and estimate.inliers.sum() > enough:
+            homography = estimate
+            if estimate.inliers.sum() > inliers.sum():
+                inliers = estimate.inliers
+    if homography is None and pair.perspective:
+        return geometry, inliers
+    return _without_parallax(pair, config, geometry, homography, inliers), inliers
+
+
+def _calibrated(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeometry, Mask] | Rejected:
+    essential = relative_pose_of_bearings(pair.bearings1, pair.bearings2, config.ransac, rng=pair.rng)
+    if isinstance(essential, Rejected):
+        mendable = pair.perspective and essential.reason != "too_few_points"
+        return _uncalibrated(pair, config) if mendable else essential
+    matrix, decisive = None, essential.inliers.sum() / config.min_calibrated_ratio
+    # F cannot win where E already explains nearly all matches.
+    if pair.perspective and decisive < pair.count:
+        fundamental = pair.fundamental(pair.limited(7, decisive))
+        if isinstance(fundamental, MatrixEstimate):
+            if fundamental.inliers.sum() > decisive:
+                return _uncalibrated(pair, config, fundamental)
+            matrix = fundamental.matrix
+    pose = essential.cam2_from_cam1
+    geometry = TwoViewGeometry(
+        *(PairKind.CALIBRATED, _NO_MATCHES, pose, essential.essential, matrix),
+        tri_angle=pair.tri_angle(pose, essential.inliers),
+    )
+    return geometry, essential.inliers
+
+
+def _uncalibrated(
+    pair: MatchedPair, config: VerificationConfig, fundamental: MatrixEstimate | None = None
+) -> tuple[TwoViewGeometry, Mask] | Rejected:
+    estimate = fundamental or pair.fundamental(config.ransac)
+    if isinstance(estimate, Rejected):
+        return estimate
+    pose, angle = None, 0.0
+    seen = pair.with_rays(estimate.inliers)
+    k1, k2 = pair.camera1.calibration_matrix, pair.camera2.calibration_matrix
+    if seen.any():
+        essential = essential_from_fundamental(estimate.matrix, k1, k2)
+        pose, _ = pose_from_essential(essential, pair.bearings1.rays[seen], pair.bearings2.rays[seen])
+        angle = pair.tri_angle(pose, seen)
+    geometry = TwoViewGeometry(PairKind.UNCALIBRATED, _NO_MATCHES, pose, F=estimate.matrix, tri_angle=angle)
+    return geometry, estimate.inliers
+
+
+def _without_parallax(
+    pair: MatchedPair,
+    config: VerificationConfig,
+    geometry: TwoViewGeometry,
+    homography: MatrixEstimate | None,
+    inliers: Mask,
+) -> TwoViewGeometry:
+    """The geometry as it is, or as a panoramic or planar one."""
+    seen = pair.with_rays(inliers)
+    matrix = homography.matrix if homography else None
+    rotation, explained = fit_rotation(pair.bearings1, pair.bearings2, seen, config.ransac.max_error_px)
+    if explained.sum() >= config.min_rotation_ratio * inliers.sum():
+        pose = Rigid3(rotation, np.zeros(3))
+        return dataclasses.replace(
+            geometry, kind=PairKind.PANORAMIC, cam2_from_cam1=pose, E=None, H=matrix, tri_angle=0.0
+        )
+    if matrix is None:
+        return geometry
+    pose = _planar_pose(pair, config, geometry.cam2_from_cam1, matrix, seen)
+    if pose is None:
+        return dataclasses.replace(geometry, kind=PairKind.PLANAR_OR_PANORAMIC, H=matrix)
+    return dataclasses.replace(
+        geometry,
+        kind=PairKind.PLANAR,
+        cam2_from_cam1=pose,
+        E=essential_from_pose(pose) if geometry.E is not None else None,
+        H=matrix,
+        tri_angle=pair.tri_angle(pose, seen),
+    )
+
+
+def _planar_pose(
+    pair: MatchedPair, config: VerificationConfig, pose: Rigid3 | None, homography: Matrix3, inliers: Mask
+) -> Rigid3 | None:
+    """The best pose among the given one and those of the homography, each refined on the epipolar errors.
+
+    F of a plane is not determined, so that the pose of an uncalibrated pair is only one candidate. The best has most
+    inliers in front of both cameras; among equals, the lowest error.
+    """
+    motions, normals = decompose_homography(
+        homography, pair.camera1.calibration_matrix, pair.camera2.calibration_matrix
+    )
+    visible = (pair.bearings1.rays[inliers] @ normals.T > 0).mean(0) > 0.5
+    moving = np.linalg.norm(motions.translation, axis=1) > 1e-9
+    candidates = [motions[int(k)] for k in np.flatnonzero(visible & moving)] + ([pose] if pose is not None else [])
+    problem, usable = essential_problem(pair.bearings1, pair.bearings2, config.ransac.max_error_px)
+    best, best_key = None, (-1.0, 0.0)
+    for candidate in candidates:
+        t = candidate.translation / np.linalg.norm(candidate.translation)
+        state = polish(problem, np.concatenate([candidate.rotation.matrix.ravel(), t]))
+        squares = problem.squared_errors(problem.model(state))
+        kept = scatter(squares < problem.max_error**2, usable)
+        if not kept.any():
+            continue
+        essential = problem.model(state).reshape(3, 3)
+        refined, front = pose_from_essential(essential, pair.bearings1.rays[kept], pair.bearings2.rays[kept])
+        key = (float(front.sum()), -float(np.minimum(squares, problem.max_error**2).sum()))
+        if key > best_key:
+            best, best_key = refined, key
+    return best
+
+
+_NO_MATCHES = np.zeros((0, 2), np.int32)
