@@ -226,14 +226,13 @@ class _Mapper:
             relative_cost_tolerance=1e-6 if final else 1e-4,
         )
         for _ in range(rounds):
-            before = int(state.on.sum())
+            before = state.on.copy()
             self.adjust_all(state, bundle)
             all_tracks = np.arange(len(state.has_point))
-            dropped = state.filter(all_tracks, config.max_error_px, min_angle)
+            state.filter(all_tracks, config.max_error_px, min_angle)
             self.triangulate_seen_by(state, np.flatnonzero(state.registered))
-            dropped += state.filter(all_tracks, config.max_error_px, min_angle)
-            changed = dropped + abs(int(state.on.sum()) - before)
-            if changed <= 0.0005 * before:
+            state.filter(all_tracks, config.max_error_px, min_angle)
+            if np.sum(state.on != before) <= 0.0005 * np.sum(before):
                 break
         if final:
             self.adjust_all(state, dataclasses.replace(bundle, relative_cost_tolerance=1e-8))

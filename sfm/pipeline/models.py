@@ -16,6 +16,7 @@ from sfm.mapping import map_incrementally
 from sfm.pipeline.colors import colorize
 from sfm.pipeline.keys import code_digest, file_digest, key_of
 from sfm.pipeline.stages import Pair, Run
+from sfm.viewgraph import calibrate_focal_lengths, poses_under
 
 STAGE = "mapping"
 
@@ -53,11 +54,21 @@ def _map(run: Run) -> list[Reconstruction]:
             decisions.append(Decision(STAGE, event.name, "inliers", float(event.inliers), threshold, verdict, detail))
         run.observer(event)
 
+    graph = database.read_view_graph()
+    keypoints = {image_id: database.read_keypoints(image_id) for image_id in used}
+    image_cameras = {image_id: image.camera_id for image_id, image in used.items()}
+    guessed = {image.camera_id: image.camera for image in used.values()}
+    cameras = calibrate_focal_lengths(graph, guessed, image_cameras)
+    decisions += [
+        Decision(STAGE, image.name, "focal_px", cameras[k].mean_focal_length, guessed[k].mean_focal_length, "estimated")
+        for image in used.values()
+        if cameras[k := image.camera_id] is not guessed[k]
+    ]
     models = map_incrementally(
-        database.read_view_graph(),
-        {image_id: database.read_keypoints(image_id) for image_id in used},
-        {image.camera_id: image.camera for image in used.values()},
-        {image_id: image.camera_id for image_id, image in used.items()},
+        poses_under(graph, keypoints, cameras, image_cameras),
+        keypoints,
+        cameras,
+        image_cameras,
         {image_id: image.name for image_id, image in used.items()},
         config.mapping,
         seed=config.seed,
@@ -78,7 +89,7 @@ def refines_intrinsics(run: Run) -> bool:
 
 
 def _key(run: Run, pair_keys: Mapping[Pair, str]) -> str:
-    code = code_digest("sfm.mapping", "sfm.bundle", "sfm.core")
+    code = code_digest("sfm.viewgraph", "sfm.mapping", "sfm.bundle", "sfm.core")
     images = [[k, image.name, image.digest, image.camera_id, image.camera] for k, image in sorted(run.images.items())]
     pairs = [[*pair, key] for pair, key in sorted(pair_keys.items())]
     return key_of(code, run.config.mapping, run.config.seed, refines_intrinsics(run), images, pairs)
