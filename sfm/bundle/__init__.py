@@ -1,1 +1,16 @@
-""""""
+"""Bundle adjustment."""
+
+from sfm.bundle.adjustment import adjust, squared_errors
+from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
+from sfm.bundle.reconstruction import free_params_of, problem_from_reconstruction, update_reconstruction
+
+__all__ = [
+    "BundleConfig",
+    "BundleProblem",
+    "BundleResult",
+    "adjust",
+    "free_params_of",
+    "problem_from_reconstruction",
+    "squared_errors",
+    "update_reconstruction",
+]

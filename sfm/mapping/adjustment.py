@@ -101,6 +101,8 @@ def _adjust(
         free_params=free_params[cameras],
         free_poses=free_poses[images],
         free_points=free_points[tracks],
+        prior_params=scene.expected_params[cameras],
+        prior_sigmas=scene.param_sigmas[cameras],
     )
     result = adjust(problem, config, threads=threads, observer=observer, scope=scope).problem
     state.R[images], state.t[images] = result.cams_from_world.rotation.matrix, result.cams_from_world.translation

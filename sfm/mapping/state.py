@@ -20,6 +20,31 @@ from sfm.mapping import _kernels
 MAX_PARAMS = 12
 
 
+_FOCAL_SIGMA = {True: 0.2, False: 0.5}
+"""Relative standard deviation of a focal length that EXIF or a file gives, and of a guessed one."""
+_PRINCIPAL_POINT_SIGMA = 0.01
+"""Of the principal point, relative to the longer side: lenses are mounted this well."""
+_DISTORTION_SIGMA = 0.2
+"""Of distortion coefficients: a strong lens has 0.3."""
+
+
+def expected_intrinsics(cameras: tuple[Camera, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Parameters (C, 12) as they are, and the standard deviations that adjustment holds them with.
+
+    The priors are weak against the thousands of observations of a real model. They matter where the photos leave a
+    parameter open: two views with two unknown focal lengths, a flat scene, a distortion that nothing shows.
+    """
+    expected, sigmas = np.zeros((len(cameras), MAX_PARAMS)), np.full((len(cameras), MAX_PARAMS), np.inf)
+    for row, camera in enumerate(cameras):
+        info = camera.model_info
+        expected[row, : len(camera.params)] = camera.params
+        focals = list(info.focal_indices)
+        sigmas[row, focals] = _FOCAL_SIGMA[camera.has_prior_focal_length] * camera.params[focals]
+        sigmas[row, list(info.principal_point_indices)] = _PRINCIPAL_POINT_SIGMA * max(camera.width, camera.height)
+        sigmas[row, list(info.extra_indices)] = _DISTORTION_SIGMA
+    return expected, sigmas
+
+
 @dataclasses.dataclass(slots=True, eq=False)
 class Scene:
     """What never changes during mapping: images, their keypoints and the tracks over them.
@@ -27,6 +52,7 @@ class Scene:
     Attributes:
         image_ids, image_names, sizes: of each image row; sizes (I, 2) px.
         camera_ids, cameras, image_camera: cameras as they came, and each image's row among them.
+        expected_params, param_sigmas: (C, 12) what their parameters are expected to be, and how closely.
         offsets, image, feature, xy: tracks as flat columns, `image` as rows.
         track_of: the track of each observation.
         image_offsets, image_observations: the observations of each image, CSR.
@@ -38,6 +64,8 @@ class Scene:
     camera_ids: np.ndarray
     cameras: tuple[Camera, ...]
     image_camera: np.ndarray
+    expected_params: np.ndarray
+    param_sigmas: np.ndarray
     keypoints: Mapping[int, Points2D]
     offsets: np.ndarray
     image: np.ndarray
@@ -64,6 +92,7 @@ class Scene:
         counts = np.array([len(keypoints[i]) for i in ids.tolist()], np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
         xy = np.concatenate([keypoints[i] for i in ids.tolist()])[starts[image] + tracks.feature_ids]
+        expected, sigmas = expected_intrinsics(used)
         return Scene(
             image_ids=ids,
             image_names=tuple(image_names[i] for i in ids.tolist()),
@@ -71,6 +100,8 @@ class Scene:
             camera_ids=camera_ids,
             cameras=used,
             image_camera=image_camera.astype(np.int32),
+            expected_params=expected,
+            param_sigmas=sigmas,
             keypoints=keypoints,
             offsets=np.array(tracks.offsets),
             image=image,
@@ -108,13 +139,10 @@ class State:
     def start(scene: Scene) -> State:
         """No image registered."""
         images, tracks = len(scene.image_ids), len(scene.offsets) - 1
-        params = np.zeros((len(scene.cameras), MAX_PARAMS))
-        for row, camera in enumerate(scene.cameras):
-            params[row, : len(camera.params)] = camera.params
         state = State(
             scene=scene,
             model_ids=np.array([camera.model_info.model_id for camera in scene.cameras], np.int32),
-            params=params,
+            params=scene.expected_params.copy(),
             ray=np.zeros((len(scene.xy), 3)),
             R=np.tile(np.eye(3), (images, 1, 1)),
             t=np.zeros((images, 3)),

@@ -1,0 +1,98 @@
+"""Bundle adjustment: cameras, poses and points of least reprojection error."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from sfm.bundle import _kernels as kernels
+from sfm.bundle.gauge import held_by_two_cameras
+from sfm.bundle.layout import lay_out
+from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
+from sfm.bundle.system import BundleSystem
+from sfm.core.arrays import FloatArray
+from sfm.core.events import SILENT, BundleAdjusted, Observer
+from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
+from sfm.core.optim.losses import evaluate_loss
+
+_LOST_PX = 100.0
+
+
+def adjust(
+    problem: BundleProblem, config: BundleConfig = BundleConfig(), *, threads: int = 1, observer: Observer = SILENT,
+    scope: str = "global",
+) -> BundleResult:  # fmt: skip
+    """Minimises ½ Σ ρ(|projected − observed|²) over the free poses, points and camera parameters.
+
+    Observations without a projection at the start take no part. A point is never moved to where it loses a
+    projection that it would keep where it is; an observation that loses its own all the same, because its camera
+    moved, is charged like the worst at the start (at least 100 px).
+
+    Args:
+        threads: the result is the same to the last bit for any number.
+        scope: passed on to the event, e.g. "local".
+    """
+    squared = squared_errors(problem)
+    active = np.isfinite(squared)
+    layout = lay_out(problem, active)
+    held = np.zeros((len(layout.slot_image), 6), bool)
+    if config.gauge == "two_cameras":
+        held = held_by_two_cameras(problem, layout)
+    worst = max(_LOST_PX**2, float(squared[active].max(initial=0.0)))
+    lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
+    system = BundleSystem(problem, layout, held, config, lost_cost, threads)
+    result = _result(problem, system, _minimize(system, config), active)
+    observer(
+        BundleAdjusted(
+            scope=scope,
+            images=len(layout.slot_image),
+            points=len(problem.points3D),
+            observations=len(layout.image),
+            iterations=result.iterations,
+            initial_cost=result.initial_cost,
+            final_cost=result.final_cost,
+            reason=result.reason,
+        )
+    )
+    return result
+
+
+def squared_errors(problem: BundleProblem) -> FloatArray:
+    """|projected − observed|² of every observation (n,) in px²; NaN where there is no projection."""
+    out = np.empty(len(problem.obs_images))
+    kernels.squared_errors(
+        problem.obs_images, problem.obs_points, problem.obs_points2D, problem.image_cameras, problem.model_ids,
+        problem.camera_params, problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation,
+        problem.points3D, out,
+    )  # fmt: skip
+    return out
+
+
+def _minimize(system: BundleSystem, config: BundleConfig) -> Summary:
+    if not system.free_count:
+        cost, gradient = system.linearize()
+        return Summary.at_once("no_free_parameters", cost, gradient)
+    rules = StopRules(
+        max_iterations=config.max_iterations,
+        relative_cost_tolerance=config.relative_cost_tolerance,
+        gradient_tolerance=config.gradient_tolerance,
+    )
+    return minimize(system, rules)
+
+
+def _result(problem: BundleProblem, system: BundleSystem, summary: Summary, active: np.ndarray) -> BundleResult:
+    return BundleResult(
+        problem=dataclasses.replace(
+            problem,
+            camera_params=system.camera_params,
+            cams_from_world=system.cams_from_world,
+            points3D=system.points3D,
+        ),
+        initial_cost=summary.initial_cost,
+        final_cost=summary.final_cost,
+        reason=summary.reason,
+        invalid=int(np.sum(~active)),
+        lost=system.lost,
+        table=summary.iterations,
+    )

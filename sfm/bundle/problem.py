@@ -1,0 +1,139 @@
+"""What an adjustment is given and what it returns."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32
+
+from sfm.core.arrays import Value, readonly
+from sfm.core.cameras._kernels import MAX_PARAMS
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
+from sfm.core.optim.losses import Loss
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class BundleProblem(Value):
+    """Cameras, poses, points and observations as flat columns, and what of them may change.
+
+    Attributes:
+        model_ids: (C,) numbers of the camera models.
+        camera_params: (C, 12) parameters in the order of the model, padded with zeros.
+        image_cameras: (I,) the row of the camera of each image.
+        cams_from_world: batch (I,), in scene units.
+        points3D: (P, 3) in the world.
+        obs_images, obs_points: (n,) the image row and the point row of each observation, in any order.
+        obs_points2D: (n, 2) px.
+        free_params: (C, 12) which camera parameters may change; padding must be False.
+        free_poses, free_points: (I,) and (P,).
+        prior_params, prior_sigmas: (C, 12) what free camera parameters are expected to be, and the standard deviation
+            of that; inf expects nothing, and so does None for all.
+
+    Raises:
+        ValueError: shapes disagree, a row does not exist, a parameter that the model lacks is free, or a standard
+            deviation is not positive.
+    """
+
+    model_ids: Int32[np.ndarray, " C"]
+    camera_params: Float64[np.ndarray, "C K"]
+    image_cameras: Int32[np.ndarray, " I"]
+    cams_from_world: Rigid3
+    points3D: Float64[np.ndarray, "P 3"]
+    obs_images: Int32[np.ndarray, " n"]
+    obs_points: Int32[np.ndarray, " n"]
+    obs_points2D: Float64[np.ndarray, "n 2"]
+    free_params: Bool[np.ndarray, "C K"]
+    free_poses: Bool[np.ndarray, " I"]
+    free_points: Bool[np.ndarray, " P"]
+    prior_params: Float64[np.ndarray, "C K"] | None = None
+    prior_sigmas: Float64[np.ndarray, "C K"] | None = None
+
+    def __post_init__(self) -> None:
+        cameras, images = len(self.model_ids), len(self.image_cameras)
+        points, observations = len(self.points3D), len(self.obs_images)
+        for name, shape, dtype in (
+            ("model_ids", (cameras,), np.int32),
+            ("camera_params", (cameras, MAX_PARAMS), np.float64),
+            ("image_cameras", (images,), np.int32),
+            ("points3D", (points, 3), np.float64),
+            ("obs_images", (observations,), np.int32),
+            ("obs_points", (observations,), np.int32),
+            ("obs_points2D", (observations, 2), np.float64),
+            ("free_params", (cameras, MAX_PARAMS), np.bool_),
+            ("free_poses", (images,), np.bool_),
+            ("free_points", (points,), np.bool_),
+        ):
+            object.__setattr__(self, name, readonly(getattr(self, name), shape, dtype))
+        if (self.prior_params is None) != (self.prior_sigmas is None):
+            raise ValueError("prior_params and prior_sigmas go together")
+        for name in ("prior_params", "prior_sigmas"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, readonly(getattr(self, name), (cameras, MAX_PARAMS)))
+        if self.prior_sigmas is not None and not np.all(self.prior_sigmas > 0):
+            raise ValueError("prior_sigmas must be positive")
+        if self.cams_from_world.shape != (images,):
+            raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
+        _check_rows("image_cameras", self.image_cameras, cameras)
+        _check_rows("obs_images", self.obs_images, images)
+        _check_rows("obs_points", self.obs_points, points)
+
+
+def _check_rows(name: str, rows: np.ndarray, count: int) -> None:
+    if len(rows) and not (rows.min() >= 0 and rows.max() < count):
+        raise ValueError(f"{name} must lie in 0..{count - 1}, got {rows.min()}..{rows.max()}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class BundleConfig:
+    """Settings of one adjustment."""
+
+    loss: Loss = "trivial"
+    """What a residual costs; trivial is plain least squares, right where outliers have been filtered."""
+    loss_scale_px: float = 1.0
+    """Residual in px from which a robust loss grows more slowly."""
+    max_iterations: int = 100
+    """Steps that are tried at most."""
+    relative_cost_tolerance: float = 1e-6
+    """Stop where a full step lowers the cost by less than this part."""
+    gradient_tolerance: float = 1e-10
+    """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
+    gauge: Literal["two_cameras", "free"] = "two_cameras"
+    """Hold one pose and one direction of motion of a second where the data leave them open, or hold nothing."""
+
+    def __post_init__(self) -> None:
+        if not self.loss_scale_px > 0:
+            raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
+        if self.max_iterations < 0:
+            raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if self.gauge not in ("two_cameras", "free"):
+            raise ValueError(f"gauge must be two_cameras or free, got {self.gauge!r}")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class BundleResult(Value):
+    """An adjusted problem and how it came about.
+
+    Attributes:
+        problem: the problem with its new cameras, poses and points; what was not free is the same to the last bit.
+        initial_cost, final_cost: ½ Σ ρ in px² over the observations that take part.
+        reason: why the iteration ended.
+        invalid: observations without a projection at the start (behind the camera, not finite); they take no part.
+        lost: observations that lost their projection on the way; each is charged like the worst at the start.
+        table: one row for each trial, the start first.
+    """
+
+    problem: BundleProblem
+    initial_cost: float
+    final_cost: float
+    reason: StopReason
+    invalid: int
+    lost: int
+    table: tuple[Iteration, ...]
+
+    @property
+    def iterations(self) -> int:
+        """Number of steps that were tried."""
+        return len(self.table) - 1

@@ -1,0 +1,151 @@
+"""Levenberg–Marquardt with Nielsen's rule for the damping.
+
+At x with gradient g, normal matrix H and D = diag(H), the step solves  (H + λ D) δ = −g.  The gain
+
+    ϱ = (F(x) − F(x ⊕ δ)) / (−½ gᵀδ + ½ λ δᵀDδ)
+
+compares what a step brings with what the quadratic model promised. A step with positive gain is taken and the
+damping becomes λ max(⅓, 1 − (2ϱ − 1)³); otherwise λ grows by ν = 2, 4, 8, … until a step brings something.
+
+A small decrease of the cost means convergence only where the damping is small: a heavily damped step is short for
+that reason alone.
+
+Reference:
+    Madsen, Nielsen & Tingleff, Methods for non-linear least squares problems, 2nd ed. 2004, §3.2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal, Protocol, TypeAlias, runtime_checkable
+
+StopReason: TypeAlias = Literal["relative_cost", "gradient", "step", "max_iterations", "no_free_parameters"]
+
+_INITIAL_DAMPING = 1e-4
+_MIN_DAMPING, _MAX_DAMPING = 1e-16, 1e20
+_FREE_DAMPING = 1.0
+"""Above it a step is less than half of the undamped one, and a small decrease says nothing."""
+_MIN_GAIN = 1e-3
+_RELATIVE_STEP = 1e-14
+"""Steps below this part of the parameters' norm are rounding."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Trial:
+    """A step that was computed but not taken: its cost, the promised decrease, its length and that of x."""
+
+    cost: float
+    predicted_decrease: float
+    step_norm: float
+    parameter_norm: float
+
+
+@runtime_checkable
+class System(Protocol):
+    """What the loop needs of a problem; it keeps the current parameters and those of the last trial."""
+
+    def linearize(self) -> tuple[float, float]:
+        """Cost and largest absolute entry of the gradient at the current parameters."""
+        ...
+
+    def try_step(self, damping: float) -> Trial | None:
+        """Solves for a step and evaluates it; None where the damped matrix is not positive definite."""
+        ...
+
+    def accept(self) -> None:
+        """Makes the parameters of the last trial the current ones."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class StopRules:
+    """When to stop: after a number of trials, at a relative decrease of the cost, at a gradient."""
+
+    max_iterations: int = 100
+    relative_cost_tolerance: float = 1e-6
+    gradient_tolerance: float = 1e-10
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Iteration:
+    """One row of the table: the state after a trial. Row 0 is the start."""
+
+    cost: float
+    cost_change: float
+    gradient_max: float
+    step_norm: float
+    damping: float
+    gain: float
+    accepted: bool
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Summary:
+    """Why the loop ended, and its table."""
+
+    reason: StopReason
+    iterations: tuple[Iteration, ...]
+
+    @staticmethod
+    def at_once(reason: StopReason, cost: float, gradient: float) -> Summary:
+        """A loop that ended before its first step."""
+        return Summary(reason, (Iteration(cost, 0.0, gradient, 0.0, _INITIAL_DAMPING, 0.0, True),))
+
+    @property
+    def initial_cost(self) -> float:
+        """The cost at the start."""
+        return self.iterations[0].cost
+
+    @property
+    def final_cost(self) -> float:
+        """The cost at the end."""
+        return self.iterations[-1].cost
+
+
+def minimize(system: System, rules: StopRules) -> Summary:
+    """Runs the loop on `system`, which holds the solution afterwards. The cost never rises."""
+    cost, gradient = system.linearize()
+    if gradient <= rules.gradient_tolerance:
+        return Summary.at_once("gradient", cost, gradient)
+    table = list(Summary.at_once("max_iterations", cost, gradient).iterations)
+    damping, growth = _INITIAL_DAMPING, 2.0
+    for _ in range(rules.max_iterations):
+        used, trial = damping, system.try_step(damping)
+        gain, change, accepted = _gain(cost, trial)
+        if accepted:
+            system.accept()
+            cost, gradient = system.linearize()
+            damping = max(_MIN_DAMPING, damping * max(1 / 3, 1 - (2 * min(gain, 1.5) - 1) ** 3))
+            growth = 2.0
+        else:
+            damping, growth = damping * growth, growth * 2
+        step = trial.step_norm if trial else 0.0
+        table.append(Iteration(cost, change if accepted else 0.0, gradient, step, used, gain, accepted))
+        reason = _stop(rules, cost, change, gradient, used, trial, accepted)
+        if reason is not None:
+            return Summary(reason, tuple(table))
+    return Summary("max_iterations", tuple(table))
+
+
+def _gain(cost: float, trial: Trial | None) -> tuple[float, float, bool]:
+    """Gain ratio, decrease of the cost, and whether the step is worth taking."""
+    if trial is None or not trial.cost <= cost or not trial.predicted_decrease > 0:
+        return 0.0, cost - trial.cost if trial else float("inf"), False
+    change = cost - trial.cost
+    gain = change / trial.predicted_decrease
+    return gain, change, bool(gain > _MIN_GAIN)
+
+
+def _stop(
+    rules: StopRules, cost: float, change: float, gradient: float, damping: float, trial: Trial | None, accepted: bool
+) -> StopReason | None:
+    if accepted and gradient <= rules.gradient_tolerance:
+        return "gradient"
+    if trial is None:
+        return "step" if damping > _MAX_DAMPING else None
+    small = rules.relative_cost_tolerance * cost
+    if damping <= _FREE_DAMPING and abs(change) <= small and trial.predicted_decrease <= small:
+        return "relative_cost"
+    if trial.step_norm <= _RELATIVE_STEP * trial.parameter_norm or damping > _MAX_DAMPING:
+        return "step"
+    return None

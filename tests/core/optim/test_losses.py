@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sfm.core.optim import evaluate_loss
+from sfm.core.optim._loss_kernels import loss_and_weight
+from sfm.core.optim.losses import loss_id
+
+LOSSES = ("trivial", "huber", "soft_l1", "cauchy")
+SQUARED = np.concatenate([[0.0], np.logspace(-6, 6, 60)])
+
+
+def written_out(loss: str, s: float, a: float) -> float:
+    r = np.sqrt(s) / a
+    by_loss = {
+        "trivial": r * r,
+        "huber": r * r if r <= 1 else 2 * r - 1,
+        "soft_l1": 2 * (np.hypot(1, r) - 1),
+        "cauchy": np.log(1 + r * r),
+    }
+    return a * a * by_loss[loss]
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("scale", [0.3, 1.0, 4.0])
+def test_losses_equal_their_formulas(loss, scale):
+    rho, _ = evaluate_loss(loss, SQUARED, scale)
+    expected = [written_out(loss, s, scale) for s in SQUARED]
+    np.testing.assert_allclose(rho, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("scale", [0.3, 1.0, 4.0])
+def test_the_weight_is_the_derivative(loss, scale):
+    s = SQUARED[1:]
+    h = 1e-4 * s
+    _, weight = evaluate_loss(loss, s, scale)
+    numeric = (evaluate_loss(loss, s + h, scale)[0] - evaluate_loss(loss, s - h, scale)[0]) / (2 * h)
+    np.testing.assert_allclose(weight, numeric, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_start_as_the_square_and_never_exceed_it(loss):
+    rho, weight = evaluate_loss(loss, SQUARED)
+    assert rho[0] == 0
+    assert weight[0] == 1
+    assert np.all(rho <= SQUARED * (1 + 1e-12))
+    assert np.all(np.diff(weight) <= 1e-15)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_the_kernel_equals_the_arrays(loss):
+    for s in SQUARED:
+        rho, weight = evaluate_loss(loss, np.array(s), 2.0)
+        assert rho.shape == ()
+        np.testing.assert_allclose((rho, weight), loss_and_weight(loss_id(loss), 2.0, s), rtol=1e-9, atol=1e-15)
+
+
+def test_an_unknown_loss_is_named():
+    with pytest.raises(ValueError, match="tukee"):
+        loss_id("tukee")
