@@ -81,12 +81,15 @@ def _measure(state: State, image1: int, image2: int, matches: np.ndarray, cam2_f
 def acceptable_pairs(
     candidates: list[InitialPair], min_inliers: int, min_angle: float, max_forward: float
 ) -> Iterator[InitialPair]:
-    """Candidates that meet the thresholds, then those that meet them halved, then quartered; each only once."""
+    """Candidates that meet the thresholds, then those that meet them halved, and so on; each only once.
+
+    The number of matches is halved twice at most, the angle down to a sixteenth: on a drive along a street all pairs
+    are narrow, and many matches make up for it. Forward motion, a poor start, is there the only one.
+    """
     given = set()
-    for relax in (1, 2, 4):
+    for relax in (1, 2, 4, 8, 16):
         for index, pair in enumerate(candidates):
-            meets = pair.inliers * relax >= min_inliers and pair.angle * relax >= min_angle
-            # A forward motion is a poor start, but for a drive along a street the only one.
+            meets = pair.inliers * min(relax, 4) >= min_inliers and pair.angle * relax >= min_angle
             meets = meets and (pair.forward <= max_forward or relax > 1)
             if meets and index not in given:
                 given.add(index)
