@@ -85,10 +85,17 @@ def _squared_error(R, t, model_id, params, X, xy):
     x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]
     y = R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]
     z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
-    u, v, ok = project_point(model_id, params, x, y, z)
+    u, v, ok = project_point(np.int64(model_id), params, x, y, z)
     if not ok:
         return np.inf
     return (u - xy[0]) ** 2 + (v - xy[1]) ** 2
+
+
+@njit(cache=True, nogil=True)
+def _copy(values, out):
+    """Three numbers; an assignment of arrays would compile the texts of its errors for more than a second."""
+    for i in range(3):
+        out[i] = values[i]
 
 
 @njit(cache=True, nogil=True)
@@ -159,7 +166,7 @@ def triangulate_tracks(
                         cost += error
                 if count > best_count or (count == best_count and cost < best_cost):
                     best_count, best_cost = count, cost
-                    best_X[:] = X
+                    _copy(X, best_X)
         if best_count < 2:
             continue
         if best_count > 2:
@@ -169,7 +176,10 @@ def triangulate_tracks(
                 i = image[seen[s]]
                 c = image_camera[i]
                 if _squared_error(R[i], t[i], model_ids[c], params[c], best_X, xy[seen[s]]) <= limit:
-                    Rs[j], ts[j], rays[j] = R[i], t[i], ray[seen[s]]
+                    _copy(t[i], ts[j])
+                    _copy(ray[seen[s]], rays[j])
+                    for row in range(3):
+                        _copy(R[i, row], Rs[j, row])
                     j += 1
             if triangulate_rays_refined(Rs, ts, rays, X):
                 count = 0
@@ -178,12 +188,12 @@ def triangulate_tracks(
                     c = image_camera[i]
                     count += _squared_error(R[i], t[i], model_ids[c], params[c], X, xy[seen[s]]) <= limit
                 if count >= best_count:
-                    best_X[:] = X
+                    _copy(X, best_X)
         for s in range(k):
             i = image[seen[s]]
             c = image_camera[i]
             on[seen[s]] = _squared_error(R[i], t[i], model_ids[c], params[c], best_X, xy[seen[s]]) <= limit
-        points[track] = best_X
+        _copy(best_X, points[track])
         has_point[track] = True
         made += 1
     return made, added

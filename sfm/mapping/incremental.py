@@ -6,7 +6,8 @@
         when the model has grown by a tenth: adjust everything, complete tracks, drop what does not fit
     adjust everything to convergence
 
-Images that are left start the next model. Every step that goes wrong is undone; nothing already won is given up.
+Images that are left start the next model. A model that folds two places onto each other (see `ambiguity`) is grown
+anew without the matches that mistake one for the other.
 
 Reference:
     Schönberger & Frahm, Structure-from-Motion Revisited, CVPR 2016.
@@ -23,10 +24,11 @@ from sfm.bundle import BundleConfig
 from sfm.core.arrays import Points2D
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.events import SILENT, ImageRegistered, Observer
+from sfm.core.events import SILENT, ImageRegistered, Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import Reconstruction, ViewGraph
 from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
+from sfm.mapping.ambiguity import unfolded
 from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
 from sfm.mapping.registration import Resection, next_images, resect
 from sfm.mapping.state import MAX_PARAMS, Scene, State
@@ -75,6 +77,8 @@ class MappingConfig:
     """Later models with fewer images are not kept; the first is."""
     max_models: int = 20
     """Models tried for at most."""
+    max_unfoldings: int = 3
+    """How often mapping starts anew because two places that look alike were laid on top of each other; 0: never."""
 
 
 def map_incrementally(
@@ -99,17 +103,21 @@ def map_incrementally(
         seed: of the resections' random samples.
         threads: changes the time, not the result.
     """
-    tracks = build_tracks(view_graph, keypoints, min_length=2)
-    scene = Scene.build(tracks, keypoints, cameras, image_cameras, image_names)
-    mapper = _Mapper(scene, view_graph, config, seed, threads, refine_intrinsics, observer)
-    models: list[State] = []
-    used = np.zeros(len(scene.image_ids), bool)
-    while len(models) < config.max_models and (state := mapper.grow_model(used)) is not None:
-        used |= state.registered
-        models.append(state)
-    models = [s for k, s in enumerate(models) if k == 0 or s.registered.sum() >= config.min_model_images]
-    models.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
-    return [state.to_reconstruction() for state in models]
+
+    def grow(graph: ViewGraph) -> list[Reconstruction]:
+        tracks = build_tracks(graph, keypoints, min_length=2)
+        scene = Scene.build(tracks, keypoints, cameras, image_cameras, image_names)
+        return _Mapper(scene, graph, config, seed, threads, refine_intrinsics, observer).grow_models()
+
+    models = grow(view_graph)
+    for attempt in range(config.max_unfoldings):
+        graphs = (unfolded(view_graph, model, suspected=attempt > 0) for model in models)
+        if (graph := next((g for g in graphs if g is not None), None)) is None:
+            break
+        dropped = len(view_graph) - len(graph)
+        observer(Note(message=f"two places look alike: leaving out {dropped} pairs that mistake one for the other"))
+        view_graph, models = graph, grow(graph)
+    return models
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -123,6 +131,17 @@ class _Mapper:
     threads: int
     refine_intrinsics: bool
     observer: Observer
+
+    def grow_models(self) -> list[Reconstruction]:
+        """Models of all images that hang together, the one with most images first."""
+        states: list[State] = []
+        used = np.zeros(len(self.scene.image_ids), bool)
+        while len(states) < self.config.max_models and (state := self.grow_model(used)) is not None:
+            used |= state.registered
+            states.append(state)
+        states = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
+        states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
+        return [state.to_reconstruction() for state in states]
 
     def grow_model(self, used: np.ndarray) -> State | None:
         """One model among the images that are not `used`; None where no pair starts one."""

@@ -240,7 +240,5 @@ class State:
             point_ids=np.arange(1, len(tracks) + 1),
             colors=np.zeros((len(tracks), 3), np.uint8),
             errors=errors[tracks],
-            tracks=Tracks(
-                np.concatenate([[0], np.cumsum(lengths)]), s.image_ids[s.image[on]], s.feature[on]
-            ),
+            tracks=Tracks(np.concatenate([[0], np.cumsum(lengths)]), s.image_ids[s.image[on]], s.feature[on]),
         )

@@ -53,7 +53,7 @@ def _collect(
     again[1:] = (label[1:] == label[:-1]) & (image[1:] == image[:-1])
     members = members[~again]
     label = labels[members]
-    _, first, lengths = np.unique(label, return_index=True, return_counts=True)
+    _, lengths = np.unique(label, return_counts=True)
     keep = np.repeat(lengths >= min_length, lengths)
     members, lengths = members[keep], lengths[lengths >= min_length]
     image = image_of[members]

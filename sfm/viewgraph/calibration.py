@@ -116,7 +116,7 @@ def _scaled_focal(camera: Camera, factor: float) -> Camera:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Terms:
-    """Pairs in columns: E at the guessed focal lengths, the rows of their unknown focal lengths (−1: known), weights."""
+    """Pairs in columns: E at the guessed focal lengths, rows of their unknown focal lengths (−1: known), weights."""
 
     essential: FloatArray
     first: np.ndarray

@@ -7,7 +7,10 @@ from sfm.mapping import build_tracks
 
 def _graph(matches):
     return ViewGraph(
-        {pair: TwoViewGeometry(PairKind.CALIBRATED, np.array(m, np.int32).reshape(-1, 2)) for pair, m in matches.items()}
+        {
+            pair: TwoViewGeometry(PairKind.CALIBRATED, np.array(m, np.int32).reshape(-1, 2))
+            for pair, m in matches.items()
+        }
     )
 
 
@@ -75,7 +78,9 @@ def test_random_graphs_agree_with_merging_sets(seed):
     }
     tracks = build_tracks(_graph(matches), keypoints)
     assert _as_sets(tracks) == _twin(matches, keypoints)
-    assert all(len(set(tracks.image_ids[a:b])) == b - a for a, b in zip(tracks.offsets, tracks.offsets[1:], strict=False))
+    assert all(
+        len(set(tracks.image_ids[a:b])) == b - a for a, b in zip(tracks.offsets, tracks.offsets[1:], strict=False)
+    )
 
 
 def test_short_tracks_can_be_left_out():
