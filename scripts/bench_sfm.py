@@ -1,6 +1,6 @@
 """Parallax beside pycolmap on real photos with known poses: quality, and the time of each stage.
 
-    python scripts/bench_sfm.py DATA [--sets fountain-P11 ...] [--json FILE] [--threads 2] [--repeat 1]
+    python -m scripts.bench_sfm DATA [--sets fountain-P11 ...] [--json FILE] [--threads 2] [--repeat 1]
 
 DATA is a folder with the image sets (see SETS). Both sides get the same images and threads, one after the other in
 the same run, at their defaults (`default`), and where the truth has intrinsics also with these given and held
