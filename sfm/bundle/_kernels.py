@@ -13,7 +13,7 @@ from sfm.core.optim._loss_kernels import loss_and_weight
 from sfm.core.optim._schur_kernels import damped_diagonal
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def squared_errors(image, point, observed, camera, model_ids, params, R, t, X, out):
     """Squared reprojection errors in px²; NaN where there is no projection."""
     for o in range(len(image)):
@@ -28,7 +28,7 @@ def squared_errors(image, point, observed, camera, model_ids, params, R, t, X, o
         out[o] = du * du + dv * dv if ok else np.nan
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def linearize(
     first, last, offsets, image, observed, coupling, point_free, camera, model_ids, columns, pose_slot,
     R, t, params, X, loss, scale, lost_cost, H, F, h, V, g, W, B,
@@ -106,7 +106,7 @@ def linearize(
     return cost
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def try_points(
     first, last, offsets, image, observed, starts, slot, coupling_offsets, coupling_slot, camera, model_ids,
     R, t, params, X, loss, scale, lost_cost, damping, M, V, g, W, B, pose_delta, camera_delta, moved, totals,
@@ -173,7 +173,7 @@ def try_points(
     totals[0], totals[1], totals[2], totals[3], totals[4] = cost, decrease, step, norm, all_lost
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def move_poses(images, delta, wxyz, t, new_wxyz, new_t, R):
     """exp(δ) from the left on the poses of `images`; fills quaternions, translations and rotation matrices."""
     for k in range(len(images)):

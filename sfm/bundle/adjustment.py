@@ -60,11 +60,12 @@ def adjust(
 
 def squared_errors(problem: BundleProblem) -> FloatArray:
     """|projected − observed|² of every observation (n,) in px²; NaN where there is no projection."""
+    # Cameras go to all kernels as int64 and writable, so that projection is compiled once.
     out = np.empty(len(problem.obs_images))
     kernels.squared_errors(
-        problem.obs_images, problem.obs_points, problem.obs_points2D, problem.image_cameras, problem.model_ids,
-        problem.camera_params, problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation,
-        problem.points3D, out,
+        problem.obs_images, problem.obs_points, problem.obs_points2D, problem.image_cameras,
+        problem.model_ids.astype(np.int64), problem.camera_params.copy(),
+        problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation, problem.points3D, out,
     )  # fmt: skip
     return out
 

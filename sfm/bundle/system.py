@@ -48,7 +48,7 @@ class BundleSystem:
         threads: int,
     ) -> None:  # fmt: skip
         self._layout, self._threads = layout, threads
-        self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.copy()
+        self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self._free_points = problem.free_points.copy()
         self._loss = (loss_id(config.loss), float(config.loss_scale_px), float(lost_cost))
         poses = problem.cams_from_world

@@ -63,7 +63,7 @@ def main(words: Sequence[str]) -> int:
         print(line)
     broken = [package.distributions[0] for package, _, fault in states if fault and not package.extra]
     if broken:
-        print(f"\nmissing: {', '.join(broken)} — pip install --force-reinstall parallax", file=sys.stderr)
+        print(f"\nmissing: {', '.join(broken)} — pip install --force-reinstall {' '.join(broken)}", file=sys.stderr)
         return ExitCode.MISSING_DEPENDENCY
     print("\nall that `sfm run` needs is there")
     return ExitCode.OK

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -35,7 +36,7 @@ class ViewOptions:
     """Write the scene to a file for the viewer, e.g. scene.rrd, and do not show it."""
 
     web: Flag = False
-    """Show it in the browser."""
+    """Show it in the browser, at an address of this machine that is printed."""
 
 
 def main(words: Sequence[str]) -> int:
@@ -56,8 +57,13 @@ def main(words: Sequence[str]) -> int:
             raise ImageError("the folder of the photos is not known", remedy="name it with --images")
         return read_image(folder / name)
 
-    show = options.save is None
-    log_reconstruction(model, photo, save=options.save, web=options.web, spawn=show and not options.web)
+    def announce(address: str) -> None:
+        print(address, flush=True)
+        print("served until Ctrl-C", file=sys.stderr)
+
+    log_reconstruction(
+        model, photo, save=options.save, web=options.web, spawn=not (options.save or options.web), announce=announce
+    )
     if options.save:
         print(options.save)
     return ExitCode.OK

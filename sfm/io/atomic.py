@@ -10,7 +10,7 @@ import contextlib
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -114,6 +114,36 @@ def write_folder(folder: Path, files: Mapping[str, Chunks], *, obsolete: Iterabl
                 (folder / name).unlink(missing_ok=True)
         finally:
             shutil.rmtree(staging, ignore_errors=True)
+
+
+def replace_folders(parent: Path, make: Callable[[Path], None], *, obsolete: Iterable[Path]) -> None:
+    """Exchanges folders in `parent` that belong together.
+
+    All new ones are complete before the old ones go. A kill in between leaves some of either kind or none, but each
+    of them whole. What an earlier kill left is removed; so nobody else may be at work in `parent`.
+
+    Args:
+        make: fills the folder that it is given with the new folders, or leaves it empty.
+        obsolete: the old ones, which go even if no new one takes their place.
+    Raises:
+        InputError: the system refuses; unless it is the very exchange that fails, the old folders are still there.
+    """
+    with os_errors(parent):
+        parent.mkdir(parents=True, exist_ok=True)
+        for path in parent.glob(".*.tmp"):
+            shutil.rmtree(path)
+        staging, waste = (parent / f".{kind}.{secrets.token_hex(4)}.tmp" for kind in ("new", "old"))
+        try:
+            staging.mkdir()
+            waste.mkdir()
+            make(staging)
+            for path in obsolete:
+                os.replace(path, waste / path.name)
+            for path in sorted(staging.iterdir()):
+                os.replace(path, parent / path.name)
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
+            shutil.rmtree(waste, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:

@@ -30,7 +30,7 @@ def convert(source: Path | str, target: Path | str, *, text: bool | None = None,
     to_ply = target.suffix.lower() == ".ply"
     taken = target.exists() if to_ply else model_format(target) is not None
     if taken and not overwrite:
-        raise InputError("is there already", path=target, remedy="choose another target, or allow to overwrite it")
+        raise InputError("is there already", path=target, remedy="choose another target, or --overwrite it")
     reconstruction = read_model(source)
     if to_ply:
         write_ply(target, reconstruction.points3D, reconstruction.colors)

@@ -109,15 +109,20 @@ def read_image(path: Path | str, *, gray: bool = False, max_size: int | None = N
     path = Path(path)
     image = _to_8_bits(_decode(read_image_bytes(path), path, gray), path)
     height, width = image.shape[:2]
-    if min(height, width) < MIN_SIDE_PX:
-        raise ImageError(
-            f"{width} × {height} px is too small", path=path, remedy=f"at least {MIN_SIDE_PX} px a side are needed"
-        )
+    check_size(width, height, path)
     if max_size is not None and max(height, width) > max_size:
         scale = max_size / max(height, width)
         size = max(1, round(width * scale)), max(1, round(height * scale))
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def check_size(width: int, height: int, path: Path) -> None:
+    """Raises ImageError where an image is too small to hold features."""
+    if min(height, width) < MIN_SIDE_PX:
+        raise ImageError(
+            f"{width} × {height} px is too small", path=path, remedy=f"at least {MIN_SIDE_PX} px a side are needed"
+        )
 
 
 def read_image_bytes(path: Path) -> bytes:

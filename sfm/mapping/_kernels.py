@@ -21,7 +21,7 @@ from sfm.core.geometry._triangulation_kernels import (
 _TRIED_PAIRS = 15
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def join_matches(edges, keypoint_image, keypoint_xy, image_count, near_px):
     """Labels of keypoints (K,): the smallest keypoint of the track, or −1 for one that is in none.
 
@@ -79,7 +79,7 @@ def join_matches(edges, keypoint_image, keypoint_xy, image_count, near_px):
     return label
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _squared_error(R, t, model_id, params, X, xy):
     """Squared reprojection error in px², inf where the point has no pixel."""
     x = R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]
@@ -91,20 +91,20 @@ def _squared_error(R, t, model_id, params, X, xy):
     return (u - xy[0]) ** 2 + (v - xy[1]) ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _copy(values, out):
     """Three numbers; an assignment of arrays would compile the texts of its errors for more than a second."""
     for i in range(3):
         out[i] = values[i]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _camera_center(R, t, out):
     for i in range(3):
         out[i] = -(R[0, i] * t[0] + R[1, i] * t[1] + R[2, i] * t[2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_tracks(
     tracks, offsets, image, xy, ray, on, points, has_point,
     registered, R, t, image_camera, model_ids, params, max_error_px, min_angle,
@@ -199,7 +199,7 @@ def triangulate_tracks(
     return made, added
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def filter_tracks(
     tracks, offsets, image, xy, on, points, has_point,
     R, t, image_camera, model_ids, params, max_error_px, min_angle,
@@ -247,7 +247,7 @@ def filter_tracks(
     return dropped
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def mean_errors(offsets, image, xy, on, points, has_point, R, t, image_camera, model_ids, params):
     """Mean reprojection error in px of each track's point, −1 for tracks without one."""
     errors = np.full(len(has_point), -1.0)
@@ -265,7 +265,7 @@ def mean_errors(offsets, image, xy, on, points, has_point, R, t, image_camera, m
     return errors
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def visibility_scores(images, image_offsets, image_observations, track_of, has_point, xy, sizes, levels):
     """How many points each image could see, and how evenly they spread over it.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 from sfm.core.events import Event, ImageRegistered, StageFinished, StageStarted
 from sfm.core.scene import Reconstruction
+from sfm.io.atomic import replace_folders
 from sfm.io.colmap_model import model_format, read_model, write_model
 from sfm.io.database import Decision
 from sfm.io.images import read_image
@@ -33,8 +33,8 @@ def map_all(run: Run, pair_keys: Mapping[Pair, str], folder: Path) -> tuple[list
         run.observer(StageStarted(stage=STAGE, total=len(run.images)))
         paths = {image.name: image.path for image in run.images.values()}
         models = [colorize(model, lambda name: read_image(paths[name])) for model in _map(run)]
+        _write_all(models, folder)
         if models:
-            _write_all(models, folder)
             run.database.set_stage_keys(STAGE, {"models": key, "files": _files_key(folder)})
     sizes = ", ".join(str(len(model.image_ids)) for model in models) or "no"
     run.observer(StageFinished(stage=STAGE, summary=f"{sizes} of {len(run.images)} images"))
@@ -110,8 +110,17 @@ def _read_all(folder: Path) -> list[Reconstruction]:
 
 
 def _write_all(models: list[Reconstruction], folder: Path) -> None:
-    obsolete = _model_folders(folder)[len(models) :]
-    for k, model in enumerate(models):
-        write_model(model, folder / str(k))
-    for path in obsolete:
-        shutil.rmtree(path)
+    """Puts these models in the place of all that are there, also if there are none: old ones must not pass for new."""
+
+    def make(staging: Path) -> None:
+        for k, model in enumerate(models):
+            write_model(model, staging / str(k))
+
+    if models or folder.exists():
+        replace_folders(folder, make, obsolete=_numbered(folder))
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """All folders with a number for a name, largest first, so that no gap arises while they are taken away."""
+    found = [path for path in folder.glob("[0-9]*") if path.name.isdecimal() and path.is_dir()]
+    return sorted(found, key=lambda path: int(path.name), reverse=True)

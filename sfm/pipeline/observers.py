@@ -114,8 +114,9 @@ class LineProgress:
         return waited >= _LINE_EVERY_S or (waited >= _LINE_GAP_S and share >= self._said_share + _LINE_EVERY_SHARE)
 
     def _say(self, text: str) -> None:
-        sys.stderr.write(f"{text}\n")
-        sys.stderr.flush()
+        with contextlib.suppress(BrokenPipeError):  # that nobody listens any more is no reason to stop the work
+            sys.stderr.write(f"{text}\n")
+            sys.stderr.flush()
         self._said_at, self._said_share = time.monotonic(), self._count.done / max(self._count.total, 1)
 
 

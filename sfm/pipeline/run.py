@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +16,6 @@ from sfm.core.execution import available_threads
 from sfm.core.scene import Reconstruction
 from sfm.io.atomic import os_errors, write_text
 from sfm.io.database import Database
-from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.pipeline.config import DEFAULTS, PipelineConfig, to_toml
 from sfm.pipeline.keys import key_of
 from sfm.pipeline.lock import locked
@@ -28,6 +26,7 @@ from sfm.pipeline.observers import LogFiles, watched
 from sfm.pipeline.report import RunReport, figures_of, no_model_error
 from sfm.pipeline.scene import Scene, read_scene
 from sfm.pipeline.stages import Run, extract_all, match_all, verify_all
+from sfm.pipeline.warm_up import kernels_compiled_ahead
 
 
 def reconstruct(
@@ -53,22 +52,24 @@ def reconstruct(
     images_folder, workspace = _checked(Path(images_folder), Path(workspace))
     threads = threads or available_threads()
     with (
+        os_errors(workspace),
         locked(workspace),
         _logged(workspace / "logs", observer) as (tell, times),
         Database.open(workspace / "database.db") as database,
-        _kernels_announced(tell),
         _one_cv2_thread(),
     ):
         write_text(workspace / "sfm.toml", to_toml(config))
 
         scene = read_scene(database, images_folder, config.cameras, threads=threads, observer=tell)
         run = Run(database, config, threads, tell, scene.images)
-        feature_keys = extract_all(run)
-        match_keys = match_all(run, feature_keys)
-        pair_keys = verify_all(run, match_keys)
-        models, model_key = map_all(run, pair_keys, workspace / "sparse")
+        with kernels_compiled_ahead(tell, calibrated=run.calibrated):
+            feature_keys = extract_all(run)
+            match_keys = match_all(run, feature_keys)
+            pair_keys = verify_all(run, match_keys)
+            models, model_key = map_all(run, pair_keys, workspace / "sparse")
 
         if not models:
+            (workspace / "manifest.json").unlink(missing_ok=True)  # of a run before, whose models are gone
             raise _no_model(run)
         report = _report(workspace, scene, models, times)
         keys = {
@@ -159,18 +160,6 @@ def _logged(folder: Path, observer: Observer) -> Iterator[tuple[Observer, dict[s
             if not expected:
                 error.add_note(f"log: {log.text_path}")
             raise
-
-
-@contextlib.contextmanager
-def _kernels_announced(observer: Observer) -> Iterator[None]:
-    """Says when the kernels must be compiled, and remembers once they are."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    new = chosen is not None and not is_complete(Path(chosen))
-    if new:
-        observer(Note(message="compiling kernels (first run only), about 20 seconds spread over the stages"))
-    yield
-    if chosen is not None and new:
-        mark_complete(Path(chosen))
 
 
 @contextlib.contextmanager

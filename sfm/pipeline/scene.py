@@ -21,7 +21,7 @@ from sfm.core.execution import ordered_map
 from sfm.io.camera_files import read_intrinsics
 from sfm.io.database import Database, Decision, ImageSource
 from sfm.io.exif import ImageInfo, prior_focal_px, read_image_info
-from sfm.io.images import list_images, read_image_bytes
+from sfm.io.images import check_size, list_images, read_image_bytes
 from sfm.pipeline.config import CameraConfig
 from sfm.pipeline.intrinsics import assigned_cameras
 from sfm.pipeline.stages import SceneImage
@@ -94,6 +94,7 @@ def _look(folder: Path, name: str, known: ImageSource | None) -> _Photo | ImageE
     try:
         status = path.stat()
         info = read_image_info(path)
+        check_size(info.width, info.height, path)
         if known and (known.size, known.mtime_ns) == (status.st_size, status.st_mtime_ns):
             return _Photo(name, path, info, known)
         digest = hashlib.blake2b(read_image_bytes(path), digest_size=16).hexdigest()

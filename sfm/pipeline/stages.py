@@ -66,6 +66,12 @@ class Run:
     observer: Observer
     images: Mapping[int, SceneImage]
 
+    @property
+    def calibrated(self) -> bool:
+        """Whether the focal lengths of most images are known."""
+        known = [image.camera.has_prior_focal_length for image in self.images.values()]
+        return 2 * sum(known) > len(known)
+
     def pair_names(self, pair: Pair) -> tuple[str, str]:
         """The names of the two images."""
         return self.images[pair[0]].name, self.images[pair[1]].name

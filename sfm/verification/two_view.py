@@ -22,6 +22,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 
 import numpy as np
+from jaxtyping import Float64
 
 from sfm.core.arrays import Mask, Matrix3, Points2D
 from sfm.core.cameras import Camera
@@ -67,8 +68,8 @@ class VerificationConfig:
 
 
 def verify_pair(
-    points2D_1: Points2D,
-    points2D_2: Points2D,
+    points2D_1: Float64[np.ndarray, "N1 2"],
+    points2D_2: Float64[np.ndarray, "N2 2"],
     matches: Matches,
     camera1: Camera,
     camera2: Camera,

@@ -59,6 +59,7 @@ def log_reconstruction(
     save: Path | None = None,
     web: bool = False,
     spawn: bool = False,
+    announce: Callable[[str], object] = lambda address: None,
 ) -> int:
     """Writes the scene, and shows it if asked; returns when the viewer is closed.
 
@@ -68,6 +69,7 @@ def log_reconstruction(
         save: file to keep the scene in, replaced if it is there; with none, it lives as long as the viewer.
         web: in the browser, from a server on this machine that nothing else can reach.
         spawn: in Rerun's own window.
+        announce: is told the address of the page where `web` is to be seen.
     Returns:
         Size of the scene in bytes.
     Raises:
@@ -81,7 +83,7 @@ def log_reconstruction(
         write_scene(reconstruction, read_image, save)
         size = save.stat().st_size
         if web or spawn:
-            show_scene(save, web=web)
+            show_scene(save, web=web, announce=announce)
     return size
 
 
@@ -104,22 +106,25 @@ def write_scene(reconstruction: Reconstruction, read_image: ReadImage, path: Pat
             partial.unlink(missing_ok=True)
 
 
-def show_scene(path: Path, *, web: bool) -> None:
+def show_scene(path: Path, *, web: bool, announce: Callable[[str], object] = lambda address: None) -> None:
     """Runs the viewer on a scene until it is closed or the user interrupts.
 
+    Args:
+        announce: is told the address of the page, if `web`.
     Raises:
         MissingDependencyError: rerun is not installed.
         SfmError: the viewer ended with an error, for instance because there is no display.
     """
     with _silent_environment(), contextlib.suppress(KeyboardInterrupt):
         if web:
-            _serve(path)
+            _serve(path, announce)
         else:
             _run_viewer(viewer_command(path))
 
 
-def _serve(path: Path) -> None:
+def _serve(path: Path, announce: Callable[[str], object]) -> None:
     with scene_server(path, viewer_files(_launcher())) as (server, address):
+        announce(address)
         webbrowser.open(address)
         server.serve_forever()
 

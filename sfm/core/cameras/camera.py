@@ -77,7 +77,7 @@ class Camera(Value):
         It is where the radial part of the distortion stops increasing; tangential and thin-prism terms, which are
         small, are judged point by point in `project`. A perspective model ends at π/2 at the latest, the others at π.
         """
-        limit = float(_kernels.distortion_limit(self.model_info.model_id, self.params))
+        limit = float(_kernels.distortion_limit(self.model_info.model_id, self.params.copy()))
         if not self.model_info.is_fisheye:
             return math.atan(limit)
         return _eucm_max_angle(*self.params[4:]) if self.model == "EUCM" else min(limit, math.pi)
@@ -87,7 +87,7 @@ class Camera(Value):
         """`max_angle` as the model measures it: tan θ for perspective models (inf without a limit), else θ."""
         if self.model_info.is_fisheye:
             return self.max_angle
-        return float(_kernels.distortion_limit(self.model_info.model_id, self.params))
+        return float(_kernels.distortion_limit(self.model_info.model_id, self.params.copy()))
 
     def with_params(self, params: Vector) -> Camera:
         """The same camera with other parameters.
@@ -120,7 +120,7 @@ class Camera(Value):
         (`max_angle`). Fisheye models do see points behind their image plane within that range. The pixel may lie
         outside the image.
         """
-        return _kernels.project(self.model_info.model_id, self.params, readonly(points3D, (None, 3)))
+        return _kernels.project(self.model_info.model_id, self.params.copy(), readonly(points3D, (None, 3)))
 
     def project_with_jacobians(self, points3D: Points3D) -> tuple[Points2D, _ByPoint, _ByParams, Mask]:
         """Pixels, their derivatives by the point and by the parameters, and validity.
@@ -128,7 +128,7 @@ class Camera(Value):
         The derivatives of a point without a pixel are zero.
         """
         points2D, by_point, by_params, valid = _kernels.project_with_jacobians(
-            self.model_info.model_id, self.params, readonly(points3D, (None, 3))
+            self.model_info.model_id, self.params.copy(), readonly(points3D, (None, 3))
         )
         return points2D, by_point, by_params[:, :, : len(self.params)], valid
 
@@ -138,7 +138,7 @@ class Camera(Value):
         A pixel that no ray reaches (beyond the image of `max_angle`; above or below a panorama) is NaN and False.
         A panorama continues periodically to its left and right.
         """
-        return _kernels.unproject(self.model_info.model_id, self.params, readonly(points2D, (None, 2)))
+        return _kernels.unproject(self.model_info.model_id, self.params.copy(), readonly(points2D, (None, 2)))
 
 
 def _eucm_max_angle(alpha: float, beta: float) -> float:

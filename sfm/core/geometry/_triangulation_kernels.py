@@ -15,7 +15,7 @@ _SINGULAR_PIVOT = 1e-13
 _REWEIGHTING_PASSES = 3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_two_rays(R1, t1, ray1, R2, t2, ray2, out):
     """The world point in the middle of the shortest segment between two rays; False (and NaN) where parallel."""
     ax, ay, az = _to_world(R1, ray1)
@@ -38,23 +38,22 @@ def triangulate_two_rays(R1, t1, ray1, R2, t2, ray2, out):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rays(Rs, ts, rays, out):
     """The world point with the least Σ of squared distances to k ≥ 2 rays; False (and NaN) where undetermined."""
     return _solve(Rs, ts, rays, False, out)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rays_refined(Rs, ts, rays, out):
     """As `triangulate_rays`, each squared distance divided by the squared range: near the least Σ sin² of angles."""
-    found = _solve(Rs, ts, rays, False, out)
-    for _ in range(_REWEIGHTING_PASSES):
-        if found:
-            found = _solve(Rs, ts, rays, True, out)
-    return found
+    for k in range(1 + _REWEIGHTING_PASSES):
+        if not _solve(Rs, ts, rays, k > 0, out):
+            return False
+    return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulation_angle(center1, center2, point):
     """Angle between the lines from two centres to a point, radians in [0, π/2], accurate for tiny angles too."""
     ax, ay, az = point[0] - center1[0], point[1] - center1[1], point[2] - center1[2]
@@ -63,13 +62,13 @@ def triangulation_angle(center1, center2, point):
     return np.arctan2(np.sqrt(nx * nx + ny * ny + nz * nz), abs(ax * bx + ay * by + az * bz))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def depth_in(R, t, point):
     """z of a world point in the camera frame."""
     return R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2] + t[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def range_along(R, t, ray, point):
     """How far along its ray a world point lies; positive is in front, for fields of view beyond 180° too."""
     total = 0.0
@@ -78,7 +77,7 @@ def range_along(R, t, ray, point):
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_pairs(R1, t1, R2, t2, rays1, rays2):
     """World points (N, 3) of two cameras' rays, and whether each lies in front of both."""
     points = np.empty((len(rays1), 3))
@@ -91,7 +90,7 @@ def triangulate_pairs(R1, t1, R2, t2, rays1, rays2):
     return points, in_front
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _to_world(R, v):
     """Rᵀ v."""
     return (
@@ -101,7 +100,7 @@ def _to_world(R, v):
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve(Rs, ts, rays, weigh, out):
     """Normal equations Σ w (I − d dᵀ)(X − c) = 0 by LDLᵀ; with `weigh`, w is the inverse squared range of `out`."""
     # Relative to the first centre, so that a scene far from the origin loses no digits.

@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})
 def factor_and_solve(S, b, panel):
     """Overwrites the lower triangle of S by L (but for its diagonal) and b by S⁻¹ b; False: not positive definite.
 

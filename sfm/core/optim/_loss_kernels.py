@@ -9,7 +9,7 @@ import numba as nb
 TRIVIAL, HUBER, SOFT_L1, CAUCHY = 0, 1, 2, 3
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def loss_and_weight(kind, scale, s):
     """(ρ(s), ρ'(s)) of a squared residual."""
     a2 = scale * scale

@@ -16,14 +16,14 @@ _RELATIVE_FLOOR = 1e-8
 _PIVOT_FLOOR = 1e-15
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def damped_diagonal(v, damping):
     """λ times the diagonal of a 3×3 block (xx, xy, xz, yy, yz, zz), each entry at least a part of the trace."""
     floor = _RELATIVE_FLOOR * (v[0] + v[3] + v[5])
     return damping * max(v[0], floor), damping * max(v[3], floor), damping * max(v[5], floor)
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def invert_blocks(first, last, V, damping, M):
     """M = (V + λ D)⁻¹ for blocks `first:last`, through Cholesky factors; zero where V is zero."""
     for p in range(first, last):
@@ -47,7 +47,7 @@ def invert_blocks(first, last, V, damping, M):
         M[p, 3], M[p, 4], M[p, 5] = c * c + e * e, e * f, f * f
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def eliminate_poses(order, starts, point, slot, W, M, g, border_offsets, border_slot, B, S, border, b):
     """Subtracts W M Wᵀ from the rows of S and the border, and adds W M g to b, for the couplings in `order`.
 
@@ -89,7 +89,7 @@ def eliminate_poses(order, starts, point, slot, W, M, g, border_offsets, border_
                     border[i, below + c, r] -= Y[r, 0] * x + Y[r, 1] * y + Y[r, 2] * z
 
 
-@nb.njit(cache=True, nogil=True, fastmath={"contract"})
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def eliminate_border(order, starts, point, slot, B, M, g, S, b):
     """The same for the border itself: B M Bᵀ off the rows of S (C K, C K), and B M g onto b (C K)."""
     size = B.shape[2]

@@ -41,8 +41,10 @@ def best_pose(data, models, max_square, best_score, squares):
     n = data.shape[1]
     index, best_inliers = -1, 0
     for k in range(models.shape[0]):
-        total, inliers, start = 0.0, 0, 0
-        while start < n and total < best_score:
+        total, inliers = 0.0, 0
+        for start in range(0, n, _BLOCK):
+            if not total < best_score:
+                break
             stop = min(start + _BLOCK, n)
             squared_reprojections(data, models[k], start, stop, squares)
             for i in range(start, stop):
@@ -51,7 +53,6 @@ def best_pose(data, models, max_square, best_score, squares):
                     inliers += 1
                 else:
                     total += max_square
-            start = stop
         if total < best_score:
             index, best_score, best_inliers = k, total, inliers
     return index, best_score, best_inliers

@@ -202,7 +202,7 @@ def five_point(data, samples, essentials):
             continue
         _action(rows, b)
         _determinant(b, det)
-        for r in range(real_roots(det, 10, roots)):
+        for r in range(real_roots(det, roots)):
             z = roots[r]
             x, y = _solve_xy(b, z)
             norm = np.sqrt(0.5 * (x * x + y * y + z * z + 1.0))

@@ -62,7 +62,7 @@ def _line_pair(conics, d, lines):
             for j in range(3):
                 cubic[1 + n] += adjugate[i, j] * conics[1 - n, j, i]
     best, s, axis = 0.0, np.nan, 0
-    count = real_roots(cubic, 3, roots)
+    count = real_roots(cubic, roots)
     for n in range(count + 1):
         root = roots[n] if n < count else s
         for i in range(3):

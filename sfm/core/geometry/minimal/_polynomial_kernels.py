@@ -46,11 +46,12 @@ def _bracketed_root(c, degree, low, high, negative_at_low):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def real_roots(coefficients, degree, roots):
+def real_roots(coefficients, roots):
     """Fills `roots` with the real roots of Σ coefficients[k] xᵏ, k = 0 … degree ≤ 10; returns how many.
 
     A root of even multiplicity may be missed or found twice; the zero polynomial has none.
     """
+    degree = coefficients.shape[0] - 1
     largest = 0.0
     for k in range(degree + 1):
         if not abs(coefficients[k]) < np.inf:
@@ -74,7 +75,7 @@ def real_roots(coefficients, degree, roots):
                 for k in range(d - 1, -1, -1):
                     f = f * high + c[k]
                 if i >= 0 and (f < 0) != negative:
-                    found[count] = _bracketed_root(c, d, low, high, negative)
+                    found[count] = _bracketed_root(c, d, low, high, not f < 0)
                     count += 1
                 low, negative = high, f < 0
         for i in range(count):
