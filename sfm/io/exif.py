@@ -75,7 +75,9 @@ def read_image_info(path: Path | str) -> ImageInfo:
             # Pillow warns of every oddity in EXIF and of large images; neither is of use to anyone here.
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                return _info(*image.size, *_tags(image))
+                info = _info(*image.size, *_tags(image))
+                # Pillow and OpenCV turn the pixels of a TIFF themselves, whatever they are told.
+                return dataclasses.replace(info, orientation=1) if image.format == "TIFF" else info
     except (Image.UnidentifiedImageError, Image.DecompressionBombError):
         # Known to OpenCV but not to Pillow (e.g. a TIFF of three 16-bit channels), or beyond its limit of pixels.
         read_image_bytes(path)

@@ -1,7 +1,7 @@
 """Image files: what is there, and their pixels.
 
 Pixels stay in the frame of the sensor: the EXIF orientation is known (`exif.read_image_info`) but never applied, so
-that photos of one camera share one calibration however it was held.
+that photos of one camera share one calibration however it was held. TIFFs are the exception: both decoders turn them.
 
 JPEGs are always decoded at full size. The decoder's built-in halving rounds the size up, so that its scale is not
 the ratio of the sizes and keypoints would move by up to half a pixel towards the far edge; it also filters

@@ -23,10 +23,10 @@ import numpy as np
 from sfm.bundle import BundleConfig
 from sfm.core.arrays import Points2D
 from sfm.core.cameras import Camera
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, ImageRegistered, Note, Observer
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.scene import Reconstruction, ViewGraph
+from sfm.core.scene import PairKind, Reconstruction, ViewGraph
 from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
 from sfm.mapping.ambiguity import unfolded
 from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
@@ -58,6 +58,8 @@ class MappingConfig:
     """Share of the visible points that must agree."""
     resection_trials: int = 3
     """Attempts for an image; it is tried again only when it sees more points than before."""
+    min_observations: int = 10
+    """Observations below which an image is taken out of the model again."""
     triangulation_max_error_px: float = 8.0
     """Reprojection error for a view to join a new point, before adjustment."""
     max_error_px: float = 4.0
@@ -79,6 +81,15 @@ class MappingConfig:
     """Models tried for at most."""
     max_unfoldings: int = 3
     """How often mapping starts anew because two places that look alike were laid on top of each other; 0: never."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            # Not `value <= 0`: NaN must fail, too.
+            if not (value > 0 or (field.name == "max_unfoldings" and value == 0)):
+                raise ConfigError(f"{field.name} must be positive, got {value}")
+        if not self.global_growth > 1:
+            raise ConfigError(f"global_growth must be above 1, got {self.global_growth}")
 
 
 def map_incrementally(
@@ -103,6 +114,9 @@ def map_incrementally(
         seed: of the resections' random samples.
         threads: changes the time, not the result.
     """
+
+    # Logos and time stamps would chain photos of different places together.
+    view_graph = ViewGraph({k: g for k, g in view_graph.pairs.items() if g.kind != PairKind.WATERMARK})
 
     def grow(graph: ViewGraph) -> list[Reconstruction]:
         tracks = build_tracks(graph, keypoints, min_length=2)
@@ -139,9 +153,9 @@ class _Mapper:
         while len(states) < self.config.max_models and (state := self.grow_model(used)) is not None:
             used |= state.registered
             states.append(state)
-        states = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
         states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
-        return [state.to_reconstruction() for state in states]
+        kept = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
+        return [state.to_reconstruction() for state in kept]
 
     def grow_model(self, used: np.ndarray) -> State | None:
         """One model among the images that are not `used`; None where no pair starts one."""
@@ -220,6 +234,8 @@ class _Mapper:
     def triangulate_seen_by(self, state: State, images: np.ndarray) -> None:
         """Makes and completes points on the tracks of these images."""
         config, tracks = self.config, state.tracks_seen_by(images)
+        # A point needs two registered images.
+        tracks = tracks[state.registered_views()[tracks] >= 2]
         if len(tracks):
             long = np.diff(self.scene.offsets)[tracks] >= config.min_track_length
             tracks = tracks[long] if long.sum() >= config.init_min_inliers else tracks
@@ -254,10 +270,19 @@ class _Mapper:
             state.filter(all_tracks, config.max_error_px, min_angle)
             self.triangulate_seen_by(state, np.flatnonzero(state.registered))
             state.filter(all_tracks, config.max_error_px, min_angle)
+            self.drop_lost_images(state)
             if np.sum(state.on != before) <= 0.0005 * np.sum(before):
                 break
         if final:
             self.adjust_all(state, dataclasses.replace(bundle, relative_cost_tolerance=1e-8), principal_points=True)
+            state.filter(np.arange(len(state.has_point)), config.max_error_px, min_angle)
+
+    def drop_lost_images(self, state: State) -> None:
+        """Takes out images whose pose hardly any observation supports any more; they may be tried again."""
+        views = np.bincount(self.scene.image[state.on], minlength=len(state.registered))
+        for image in np.flatnonzero(state.registered & (views < self.config.min_observations)).tolist():
+            state.unregister(image)
+            self.tell(state, image, Rejected("lost_observations", f"{views[image]} of its observations still fit"))
 
     def adjust_all(self, state: State, bundle: BundleConfig, *, principal_points: bool = False) -> None:
         """Adjusts everything; a camera that this drives out of bounds goes back and is held."""

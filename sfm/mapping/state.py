@@ -176,10 +176,6 @@ class State:
             rows = np.flatnonzero(observed_by == row)
             self.ray[rows] = self.camera(row).unproject(self.scene.xy[rows])[0]
 
-    def pose(self, image: int) -> Rigid3:
-        """`cam_from_world` of an image."""
-        return Rigid3(Rotation3.from_matrix(self.R[image]), self.t[image].copy())
-
     def set_pose(self, image: int, cam_from_world: Rigid3) -> None:
         """Registers an image."""
         self.R[image], self.t[image] = cam_from_world.rotation.matrix, cam_from_world.translation
@@ -191,10 +187,15 @@ class State:
         tracks = np.unique(self.scene.track_of[rows[self.on[rows]]])
         self.on[rows] = False
         self.registered[image] = False
-        seen = np.add.reduceat(self.on.astype(np.int64), self.scene.offsets[:-1]) if len(self.scene.xy) else []
-        lost = tracks[np.asarray(seen)[tracks] < 2]
+        seen = np.bincount(self.scene.track_of[self.on], minlength=len(self.has_point))
+        lost = tracks[seen[tracks] < 2]
         self.has_point[lost] = False
         self.on[np.isin(self.scene.track_of, lost)] = False
+
+    def registered_views(self) -> np.ndarray:
+        """How many registered images each track has (T,)."""
+        seen = self.registered[self.scene.image]
+        return np.bincount(self.scene.track_of[seen], minlength=len(self.has_point))
 
     def tracks_seen_by(self, images: np.ndarray) -> np.ndarray:
         """Sorted tracks with an observation in these images, whether they have a point or not."""

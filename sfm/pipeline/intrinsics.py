@@ -2,7 +2,7 @@
 
 A file with one camera stands for all images. A file with several serves by size: an image takes the camera of its
 own size, or failing that the one whose size is a pure multiple of its own. Where several cameras fit alike, their
-number must be that of the images, and they are taken in order: camera ids ascending, image names sorted.
+number must be that of the images, and they are taken in order: camera ids ascending, image names sorted as text.
 """
 
 from __future__ import annotations
@@ -23,14 +23,18 @@ def assigned_cameras(
 
     Args:
         cameras: by id, not empty.
-        images: name, width and height in px, sorted by name.
+        images: name, width and height in px.
         path: the file, for messages.
     Raises:
-        ConfigError: no camera fits an image, or several do.
+        ConfigError: no camera fits an image, or several do; or a focal length is not positive.
     """
-    if len(cameras) == 1 or len(cameras) != len(images):
+    for camera_id, camera in cameras.items():
+        if min(camera.focal_lengths) <= 0:
+            raise ConfigError(f"camera {camera_id} has a focal length that is not positive", path=path)
+    fits = [len(_fitting(cameras, width, height)) for _, width, height in images]
+    if len(cameras) != len(images) or max(fits, default=1) == 1:
         return {name: _by_size(cameras, name, width, height, path) for name, width, height in images}
-    in_order = zip(images, sorted(cameras.items()), strict=True)
+    in_order = zip(sorted(images), sorted(cameras.items()), strict=True)
     return {
         name: (camera_id, _resized(camera, name, width, height, path))
         for (name, width, height), (camera_id, camera) in in_order
@@ -67,9 +71,14 @@ def _is_multiple(camera: Camera, width: int, height: int) -> bool:
     return lowest < highest
 
 
-def _by_size(cameras: Mapping[int, Camera], name: str, width: int, height: int, path: str) -> tuple[int, Camera]:
+def _fitting(cameras: Mapping[int, Camera], width: int, height: int) -> list[tuple[int, Camera]]:
+    """The cameras of an image's size, or failing that, those whose size is a multiple of it, resized."""
     exact = [(k, camera) for k, camera in cameras.items() if (camera.width, camera.height) == (width, height)]
-    fitting = exact or [(k, r) for k, camera in cameras.items() if (r := resized_camera(camera, width, height))]
+    return exact or [(k, r) for k, camera in cameras.items() if (r := resized_camera(camera, width, height))]
+
+
+def _by_size(cameras: Mapping[int, Camera], name: str, width: int, height: int, path: str) -> tuple[int, Camera]:
+    fitting = _fitting(cameras, width, height)
     if len(fitting) == 1:
         return fitting[0]
     if not fitting:

@@ -72,7 +72,9 @@ def _is_alive(owner: dict[str, Any]) -> bool:
         return False
     if owner.get("host") != socket.gethostname() or os.name == "nt":
         return True
-    pid = int(owner.get("pid", 0))
+    pid = owner.get("pid")
+    if not isinstance(pid, int) or pid <= 0:
+        return False
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

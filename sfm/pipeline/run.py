@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 from sfm.core.errors import ConfigError, InputError, SfmError
-from sfm.core.events import SILENT, Event, Note, Observer, StageFinished, StageStarted
+from sfm.core.events import SILENT, Event, Observer, StageFinished, StageStarted
 from sfm.core.execution import available_threads
 from sfm.core.scene import Reconstruction
 from sfm.io.atomic import os_errors, write_text
@@ -58,9 +58,9 @@ def reconstruct(
         Database.open(workspace / "database.db") as database,
         _one_cv2_thread(),
     ):
-        write_text(workspace / "sfm.toml", to_toml(config))
-
         scene = read_scene(database, images_folder, config.cameras, threads=threads, observer=tell)
+        # Only now: settings that do not fit the photos must not be kept for the next run.
+        write_text(workspace / "sfm.toml", to_toml(config))
         run = Run(database, config, threads, tell, scene.images)
         with kernels_compiled_ahead(tell, calibrated=run.calibrated):
             feature_keys = extract_all(run)

@@ -80,7 +80,7 @@ class Run:
 def extract_all(run: Run) -> dict[int, str]:
     """Features of all images; returns the key of each."""
     stage, config = "features", run.config.features
-    basis = key_of(code_digest("sfm.features"), cv2.__version__, config)
+    basis = key_of(code_digest("sfm.features", "sfm.io", "sfm.core"), cv2.__version__, config)
     keys = {image_id: key_of(basis, image.digest) for image_id, image in run.images.items()}
     counts = run.database.feature_counts()
     stale = _stale(run, stage, keys, present=counts)
@@ -112,7 +112,7 @@ def extract_all(run: Run) -> dict[int, str]:
 def match_all(run: Run, feature_keys: Mapping[int, str]) -> dict[Pair, str]:
     """Putative matches of all pairs of images that have features; returns the key of each pair."""
     stage, config = "matching", run.config.matching
-    basis = key_of(code_digest("sfm.matching"), config)
+    basis = key_of(code_digest("sfm.matching", "sfm.core"), config)
     counts = run.database.feature_counts()
     pairs = exhaustive_pairs(image_id for image_id in run.images if counts.get(image_id))
     keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from sfm.core.cameras import Camera
+from sfm.core.errors import ConfigError
 from sfm.core.events import ImageRegistered
 from sfm.core.geometry.similarity import Sim3, estimate_similarity
-from sfm.core.scene import ViewGraph
-from sfm.mapping import map_incrementally
+from sfm.core.scene import PairKind, ViewGraph
+from sfm.mapping import MappingConfig, build_tracks, map_incrementally
+from sfm.mapping.state import Scene, State
 from tests.mapping.scenes import PointScene
 
 
@@ -129,3 +131,30 @@ def test_every_registration_is_told():
     _map(scene, refine_intrinsics=False, observer=events.append)
     told = [e.name for e in events if isinstance(e, ImageRegistered) and not e.reason]
     assert sorted(told) == [f"{i:03d}.jpg" for i in range(1, 6)]
+
+
+def test_watermarks_are_not_matches():
+    scene = PointScene(images=4)
+    pairs = {p: dataclasses.replace(g, kind=PairKind.WATERMARK) for p, g in scene.view_graph.pairs.items()}
+    scene.view_graph = ViewGraph(pairs)
+    assert _map(scene) == []
+
+
+def test_an_image_that_loses_its_observations_is_taken_out():
+    scene = PointScene(images=5, seed=3)
+    tracks = build_tracks(scene.view_graph, scene.keypoints)
+    built = Scene.build(tracks, scene.keypoints, scene.cameras, scene.image_cameras, scene.image_names)
+    state = State.start(built)
+    for image, pose in enumerate(scene.poses):
+        state.set_pose(image, pose)
+    state.triangulate(np.arange(len(tracks)), 4.0, 0.01)
+    state.unregister(2)
+    assert not state.registered[2]
+    assert not state.on[built.observations_of(2)].any()
+    assert np.all(np.bincount(built.track_of[state.on], minlength=len(tracks))[state.has_point] >= 2)
+
+
+@pytest.mark.parametrize("settings", [{"max_error_px": -1.0}, {"loss_scale_px": np.nan}, {"global_growth": 0.5}])
+def test_settings_out_of_range_are_refused(settings):
+    with pytest.raises(ConfigError):
+        MappingConfig(**settings)

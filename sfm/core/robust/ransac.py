@@ -25,7 +25,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from sfm.core.arrays import FloatArray, Mask
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.robust._damping_kernels import damped_step
 from sfm.core.robust._two_view_kernels import CAUCHY, TRUNCATED
 
@@ -53,6 +53,12 @@ class RansacConfig:
     """Fewer inliers are a rejection, as in COLMAP."""
     min_inlier_ratio: float = 0.0
     """A smaller fraction of inliers is a rejection."""
+
+    def __post_init__(self) -> None:
+        if not self.max_error_px > 0:
+            raise ConfigError(f"max_error_px must be positive, got {self.max_error_px}")
+        if not 0 < self.confidence < 1:
+            raise ConfigError(f"confidence must lie between 0 and 1, got {self.confidence}")
 
 
 @runtime_checkable
@@ -108,6 +114,8 @@ class Estimate:
 
 def required_iterations(inliers: int, count: int, sample_size: int, config: RansacConfig) -> int:
     """Samples needed to draw one of inliers only with the configured confidence, within the configured limits."""
+    if count < sample_size:
+        return config.max_iterations
     clean = math.prod(max(inliers - i, 0) / (count - i) for i in range(sample_size))
     if clean >= 1 - 1e-12:
         return config.min_iterations
