@@ -9,13 +9,13 @@ has not reached when a stage comes is compiled there and then. Nothing that a ru
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from sfm.core.arrays import Points2D
@@ -24,7 +24,7 @@ from sfm.core.errors import Rejected
 from sfm.core.events import Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from sfm.core.scene import Features, Matches, TwoViewGeometry, ViewGraph
+from sfm.core.scene import Features, Matches, Reconstruction, TwoViewGeometry, ViewGraph
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
 from sfm.matching import match_features
@@ -35,7 +35,7 @@ _IMAGES, _POINTS, _STRAYS = 6, 240, 24
 
 @contextlib.contextmanager
 def kernels_compiled_ahead(observer: Observer, *, calibrated: bool) -> Iterator[None]:
-    """While kernels are missing in numba's cache: says so, compiles them on a thread, and notes when a run has them all.
+    """While kernels are missing in numba's cache: says so, compiles them on a thread, and notes when all are there.
 
     The thread ends with the block, at the latest when the step that it is at is done. A failure of it is told as a
     warning: the kernels that the run itself needs were compiled by the stages then.
@@ -48,7 +48,8 @@ def kernels_compiled_ahead(observer: Observer, *, calibrated: bool) -> Iterator[
         yield
         return
     observer(Note(message="compiling kernels (first run only), about 20 seconds, mostly beside the first stages"))
-    with _in_background([] if numba.config.DISABLE_JIT else _steps(calibrated), observer):
+    compiles = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
+    with _rare_garbage_collection(), _in_background(_steps(calibrated) if compiles else [], observer):
         yield
     mark_complete(Path(folder))
 
@@ -71,6 +72,17 @@ def _in_background(steps: Sequence[Callable[[], object]], observer: Observer) ->
             over.set()
     if (error := work.exception()) is not None:
         observer(Note(message=f"compiling ahead failed: {type(error).__name__}: {error}", level="warning"))
+
+
+@contextlib.contextmanager
+def _rare_garbage_collection() -> Iterator[None]:
+    """Compilation makes many objects that live long: looking through them again and again is a tenth of its time."""
+    before = gc.get_threshold()
+    gc.set_threshold(100_000, *before[1:])
+    try:
+        yield
+    finally:
+        gc.set_threshold(*before)
 
 
 def _steps(calibrated: bool) -> list[Callable[[], object]]:
@@ -103,10 +115,10 @@ def _verified(calibrated: bool, pairs: int) -> ViewGraph:
     return ViewGraph(found)
 
 
-def _map(calibrated: bool) -> None:
+def _map(calibrated: bool) -> list[Reconstruction]:
     graph, keypoints = _verified(calibrated, pairs=_IMAGES**2), _keypoints()
     owners, names = dict.fromkeys(keypoints, 1), {k: str(k) for k in keypoints}
-    map_incrementally(graph, keypoints, {1: _camera(calibrated)}, owners, names)
+    return map_incrementally(graph, keypoints, {1: _camera(calibrated)}, owners, names)
 
 
 def _camera(calibrated: bool) -> Camera:

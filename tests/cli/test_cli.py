@@ -17,40 +17,9 @@ import pytest
 from PIL import Image
 
 from sfm import cli
+from tests.pictures import texture
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="session")
-def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """One cache of kernels for all processes of the session, unless there is one already."""
-    chosen = os.environ.get("NUMBA_CACHE_DIR") or str(tmp_path_factory.mktemp("kernels"))
-    return os.environ | {"PYTHONPATH": str(ROOT), "NUMBA_CACHE_DIR": chosen, "COLUMNS": "200"}
-
-
-@pytest.fixture
-def sfm(environment, tmp_path):
-    def run(*words: object, module: str = "sfm") -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-W", "error", "-m", module, *map(str, words)],
-            capture_output=True,
-            text=True,
-            env=environment,
-            cwd=tmp_path,
-            timeout=300,
-        )
-
-    return run
-
-
-def texture(seed: int, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
-    """RGB."""
-    rng = np.random.default_rng(seed)
-    layers = [
-        cv2.resize(rng.normal(size=(shape[0] // s, shape[1] // s, 3)), shape[::-1], interpolation=cv2.INTER_CUBIC) * s
-        for s in (2, 4, 8)
-    ]
-    return np.clip(np.rint(128 + 8 * sum(layers)), 0, 255).astype(np.uint8)
 
 
 def errors(result: subprocess.CompletedProcess[str]) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sfm.core.errors import InputError
-from sfm.io.atomic import atomic_path, write_bytes, write_folder, write_text
+from sfm.io.atomic import atomic_path, replace_folders, write_bytes, write_folder, write_text
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -62,6 +62,29 @@ def test_a_folder_keeps_what_is_not_superseded(tmp_path: Path) -> None:
     write_folder(folder, {"a": [b"3"]}, obsolete=["old", "never there"])
     assert sorted(os.listdir(folder)) == ["a", "mine"]
     assert (folder / "a").read_bytes() == b"3"
+
+
+def test_folders_are_exchanged_once_all_new_ones_are_there(tmp_path: Path) -> None:
+    def make(count: int, text: str, staging: Path) -> None:
+        for k in range(count):
+            write_folder(staging / str(k), {"a": [text.encode()]})
+
+    def contents() -> dict[str, str]:
+        return {
+            path.relative_to(tmp_path).as_posix(): path.read_text() for path in tmp_path.rglob("*") if path.is_file()
+        }
+
+    replace_folders(tmp_path, lambda staging: make(3, "first", staging), obsolete=[])
+    (tmp_path / "notes").touch()
+    (tmp_path / ".new.0123.tmp").mkdir()
+    old = [tmp_path / str(k) for k in range(3)]
+    with pytest.raises(ZeroDivisionError):
+        replace_folders(tmp_path, lambda staging: make(1 // 0, "", staging), obsolete=old)
+    assert contents() == {"0/a": "first", "1/a": "first", "2/a": "first", "notes": ""}
+    replace_folders(tmp_path, lambda staging: make(2, "second", staging), obsolete=old)
+    assert contents() == {"0/a": "second", "1/a": "second", "notes": ""}
+    replace_folders(tmp_path, lambda staging: None, obsolete=old[:2])
+    assert os.listdir(tmp_path) == ["notes"]
 
 
 def test_what_stands_in_the_way_is_named(tmp_path: Path) -> None:

@@ -13,16 +13,7 @@ from sfm.core.events import ImageRegistered
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import PairKind, Reconstruction, Tracks, TwoViewGeometry
 from sfm.pipeline import models, stages
-
-
-def texture(seed: int, shape: tuple[int, int] = (120, 160)) -> np.ndarray:
-    """A picture with detail at several scales, RGB."""
-    rng = np.random.default_rng(seed)
-    layers = [
-        cv2.resize(rng.normal(size=(shape[0] // s, shape[1] // s, 3)), shape[::-1], interpolation=cv2.INTER_CUBIC) * s
-        for s in (2, 4, 8)
-    ]
-    return np.clip(np.rint(128 + 8 * sum(layers)), 0, 255).astype(np.uint8)
+from tests.pictures import texture
 
 
 def write_photo(path: Path, image: np.ndarray) -> None:

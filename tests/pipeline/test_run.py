@@ -274,6 +274,16 @@ def test_photos_of_different_things_are_told_apart(tmp_path):
         run(tmp_path / "photos", tmp_path / "ws")
 
 
+def test_models_that_no_longer_hold_go_with_the_manifest(photos, tmp_path, monkeypatch):
+    run(photos, tmp_path / "ws")
+    (tmp_path / "ws" / "sparse" / "1").mkdir()
+    monkeypatch.setattr("sfm.pipeline.models.map_incrementally", lambda *arguments, **options: [])
+    with pytest.raises(ReconstructionError):
+        run(photos, tmp_path / "ws", PipelineConfig(seed=1))
+    assert list((tmp_path / "ws" / "sparse").iterdir()) == []
+    assert not (tmp_path / "ws" / "manifest.json").exists()
+
+
 def test_one_photo_is_not_enough(tmp_path):
     (tmp_path / "photos").mkdir()
     cv2.imwrite(str(tmp_path / "photos" / "only.png"), texture(1))

@@ -69,6 +69,16 @@ def test_a_solid_scene_seen_by_calibrated_cameras_is_calibrated(camera):
     assert found.E is not None
 
 
+def test_keypoints_without_a_match_change_nothing():
+    p1, p2, matches, _ = _pair(PINHOLE)
+    more = np.concatenate([p2, np.random.default_rng(2).uniform(0, 1, (70, 2)) * SIZE])
+    first, second = (
+        verify_pair(p1, points, matches, PINHOLE, PINHOLE, rng=np.random.default_rng(1)) for points in (p2, more)
+    )
+    assert first.matches.tolist() == second.matches.tolist()
+    assert (first.cam2_from_cam1.matrix == second.cam2_from_cam1.matrix).all()
+
+
 def test_the_triangulation_angle_is_that_of_the_scene():
     found, _, _ = _verify(PINHOLE, outliers=0.0, noise=0.0)
     rng = np.random.default_rng(0)

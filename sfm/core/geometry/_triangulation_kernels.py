@@ -47,10 +47,10 @@ def triangulate_rays(Rs, ts, rays, out):
 @njit(cache=True, nogil=True, error_model="numpy")
 def triangulate_rays_refined(Rs, ts, rays, out):
     """As `triangulate_rays`, each squared distance divided by the squared range: near the least Σ sin² of angles."""
+    found = True
     for k in range(1 + _REWEIGHTING_PASSES):
-        if not _solve(Rs, ts, rays, k > 0, out):
-            return False
-    return True
+        found = found and _solve(Rs, ts, rays, k > 0, out)
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
