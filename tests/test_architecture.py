@@ -79,14 +79,21 @@ def faults(tree: ast.Module, path: str) -> list[str]:
     return found + kernel_faults(tree, stem) + unsafe(tree)
 
 
+def extends_numba(node: ast.FunctionDef) -> bool:
+    """Whether a function tells numba how to compile another."""
+    names = [name_of(d.func if isinstance(d, ast.Call) else d) for d in node.decorator_list]
+    return names in (["intrinsic"], ["overload"])
+
+
 def kernel_faults(tree: ast.Module, stem: str) -> list[str]:
     """Breaches of the rules for kernels."""
     if not stem.endswith("_kernels"):
         return ["compiles outside a module named *_kernels"] if any(compiled(tree)) else []
     found = [] if stem.startswith("_") else ["a module of kernels is private"]
     for node in ast.walk(tree):
-        # A function without decorator runs once, at import, and builds a table of constants.
-        if isinstance(node, ast.FunctionDef) and node.decorator_list:
+        # A function without decorator runs once, at import, and builds a table of constants; or is the plain form
+        # of one that is written out for the compiler.
+        if isinstance(node, ast.FunctionDef) and node.decorator_list and not extends_numba(node):
             settings = [d for d in node.decorator_list if isinstance(d, ast.Call) and name_of(d.func).endswith("njit")]
             if len(node.decorator_list) != 1 or not settings:
                 found.append(f"{node.name} is not decorated by njit(...) alone")

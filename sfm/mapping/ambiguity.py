@@ -10,9 +10,9 @@ places (a tree, a poster, the house next door) is seen by one of them only. Chan
 everywhere; a difference empties whole cells of a grid over the image while others are full.
 
 The points of emptied cells tell the places apart. With s_i = ±1 the place of image i, the sum Σ w_ij s_i s_j is made
-large, where w_ij is the share of those points that i and j both see, and w_ij = −1 for the two images of a missing
-observation or of a contradiction. Matches between the places are then dropped, except those that contradicted the
-fold: they are the true links between the places.
+large, where w_ij is the share of those points that i and j both see, −1 for the two images of a missing observation
+and a little below 0 for those of a contradiction. Matches between the places are then dropped, except those that
+contradicted the fold: they are the true links between the places.
 
 References:
     Heinly, Dunn & Frahm, Correcting for duplicate scene structure in sparse 3D reconstruction, ECCV 2014.
@@ -36,6 +36,10 @@ _CONSISTENT_PX = 8.0
 _MAX_CONSISTENT = 0.3
 _MIN_CONTRADICTION = 0.01
 """Contradicting matches, as a share of all, from which a model is doubted at all."""
+
+_CONTRADICTION_WEIGHT = 0.1
+"""Of a contradiction against a missing observation: where an image between the places ended up on the wrong one, its
+true neighbours contradict it, too."""
 
 _MIN_TRACK = 3
 _MIN_EXPECTED = 100
@@ -173,8 +177,8 @@ def _places(model: Reconstruction, differences: list[Difference], contradicting:
         weight[difference.seen_by, difference.missed_by] -= 1.0
         weight[difference.missed_by, difference.seen_by] -= 1.0
     for i, j in contradicting:
-        weight[row[i], row[j]] -= 1.0
-        weight[row[j], row[i]] -= 1.0
+        weight[row[i], row[j]] -= _CONTRADICTION_WEIGHT
+        weight[row[j], row[i]] -= _CONTRADICTION_WEIGHT
     place = _balanced(weight)
     should_see = _should_see(model, sees)
     proper = [

@@ -41,33 +41,37 @@ def kernels_compiled_ahead(observer: Observer, *, calibrated: bool) -> Iterator[
     warning: the kernels that the run itself needs were compiled by the stages then.
 
     Args:
-        calibrated: focal lengths are known, so that this kind of verification will be needed first.
+        calibrated: focal lengths are known, so that this kind of verification will be needed.
     """
     folder = os.environ.get("NUMBA_CACHE_DIR")
     if folder is None or is_complete(Path(folder)):
         yield
         return
-    observer(Note(message="compiling kernels (first run only), about 20 seconds, mostly beside the first stages"))
+    observer(Note(message="compiling kernels (first run only), about 25 seconds, partly beside the first stages"))
     compiles = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
-    with _rare_garbage_collection(), _in_background(_steps(calibrated) if compiles else [], observer):
+    steps = _steps(calibrated) if compiles else []
+    with _rare_garbage_collection(), _in_background(steps, observer) as done:
         yield
-    mark_complete(Path(folder))
+    if compiles and len(done) == len(steps):
+        mark_complete(Path(folder))
 
 
 @contextlib.contextmanager
-def _in_background(steps: Sequence[Callable[[], object]], observer: Observer) -> Iterator[None]:
-    """Takes the steps on a thread; leaves out those that are left when the block ends."""
+def _in_background(steps: Sequence[Callable[[], object]], observer: Observer) -> Iterator[list[int]]:
+    """Takes the steps on a thread, and tells which are done; leaves out those that are left when the block ends."""
     over = threading.Event()
+    done: list[int] = []
 
     def take() -> None:
-        for step in steps:
+        for number, step in enumerate(steps):
             if not over.is_set():
                 step()
+                done.append(number)
 
     with ThreadPoolExecutor(1, thread_name_prefix="warm-up") as pool:
         work = pool.submit(take)
         try:
-            yield
+            yield done
         finally:
             over.set()
     if (error := work.exception()) is not None:
@@ -86,13 +90,8 @@ def _rare_garbage_collection() -> Iterator[None]:
 
 
 def _steps(calibrated: bool) -> list[Callable[[], object]]:
-    """In the order of the stages; last, the verification of cameras of the other kind, for a later run."""
-    return [
-        _match,
-        lambda: _verified(calibrated, pairs=1),
-        lambda: _map(calibrated),
-        lambda: _verified(not calibrated, pairs=1),
-    ]
+    """In the order of the stages."""
+    return [_match, lambda: _verified(calibrated, pairs=1), lambda: _map(calibrated)]
 
 
 def _match() -> None:

@@ -11,8 +11,6 @@ import sys
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from PIL import Image
 
@@ -103,28 +101,6 @@ def test_a_missing_an_empty_and_a_wrong_folder_are_bad_input(sfm, tmp_path):
     assert_one_line(sfm("run", "empty"), 3, "empty: there are no photos in this folder")
     assert_one_line(sfm("run", "file.jpg"), 3, "is a file")
     assert not (tmp_path / "absent-sfm").exists()
-
-
-def test_a_folder_of_horrors_is_read_without_a_crash(sfm, tmp_path):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    Image.fromarray(texture(1)).save(photos / "whole.jpg", quality=95)
-    (photos / "corrupt.jpg").write_bytes((photos / "whole.jpg").read_bytes()[:5000])
-    (photos / "text.jpg").write_text("I am no photo.")
-    (photos / "empty.png").write_bytes(b"")
-    Image.fromarray(texture(2)[..., 0]).save(photos / "one_channel.png")
-    cv2.imwrite(str(photos / "sixteen_bit.png"), texture(3)[..., 0].astype(np.uint16) * 257)
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(texture(4)).save(photos / "rotated.jpg", exif=exif, quality=95)
-    result = sfm("run", "photos", "-o", "ws")
-    assert_one_line(result, 4, "no two of 4 photos show the same scene")
-    for name, reason in (("corrupt.jpg", "truncated"), ("text.jpg", "text file"), ("empty.png", "empty")):
-        assert re.search(f"{name}: [^;]*{reason}", result.stderr)
-    log = next((tmp_path / "ws" / "logs").glob("*.jsonl")).read_text().splitlines()
-    found = {row["name"]: row["count"] for row in map(json.loads, log) if row["event"] == "FeaturesExtracted"}
-    assert set(found) == {"whole.jpg", "one_channel.png", "sixteen_bit.png", "rotated.jpg"}
-    assert min(found.values()) > 100
 
 
 def test_two_unrelated_photos_fail_with_one_line(sfm, tmp_path):

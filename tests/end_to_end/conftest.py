@@ -17,7 +17,7 @@ from sfm.pipeline.run import reconstruct
 
 SENSOR = SensorConfig(noise=0.004, blur_px=0.0, exposure_jitter_ev=0.05, jpeg_quality=None)
 """A camera by day whose errors are those of the detector, not of the file format."""
-MOMENTS = {"rig": 4}
+MOMENTS = {"rig": 4, "twins": 12}
 SIZES = {"orbit": (1024, 768)}
 """The orbit has fewest keypoints: at 800 × 600 an unknown camera leaves its rotations 0.08° off, here 0.02°."""
 

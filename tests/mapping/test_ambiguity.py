@@ -73,7 +73,7 @@ def _common(first, second):
 
 @pytest.fixture(scope="module")
 def twins():
-    return TwinScene()
+    return TwinScene(seed=3)
 
 
 def test_without_the_check_the_twins_are_laid_on_top_of_each_other(twins):
