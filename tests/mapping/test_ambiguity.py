@@ -73,6 +73,8 @@ def _common(first, second):
 
 @pytest.fixture(scope="module")
 def twins():
+    # One of two seeds among 0 to 3 that end unfolded: the walls make up most of what is seen, and telling them apart
+    # is not reliable. The test shows that it can be done; docs/accuracy.md says where it was not.
     return TwinScene(seed=3)
 
 
