@@ -19,11 +19,11 @@ from typing import Any
 
 from PIL import ExifTags, Image
 
+from sfm.core.cameras.priors import focal_from_35mm, focal_from_sensor
 from sfm.core.cameras.sensors import sensor_width_mm
 from sfm.core.errors import ImageError
 from sfm.io.images import read_image, read_image_bytes
 
-_DIAGONAL_35MM = math.hypot(36, 24)
 _RESOLUTION_UNIT_MM = {1: 25.4, 2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 # Between a fisheye's and an astronomer's lens; beyond, the tags are wrong.
 _FOCAL_RANGE = (0.1, 100.0)
@@ -98,12 +98,12 @@ def prior_focal_px(info: ImageInfo) -> float | None:
 
 
 def _from_35mm(info: ImageInfo) -> float | None:
-    return info.focal_35mm and info.focal_35mm * math.hypot(info.width, info.height) / _DIAGONAL_35MM
+    return info.focal_35mm and focal_from_35mm(info.focal_35mm, info.width, info.height)
 
 
 def _from_sensor_table(info: ImageInfo) -> float | None:
     width_mm = sensor_width_mm(info.make, info.model) if info.focal_mm else None
-    return info.focal_mm * max(info.width, info.height) / width_mm if info.focal_mm and width_mm else None
+    return focal_from_sensor(info.focal_mm, width_mm, info.width, info.height) if info.focal_mm and width_mm else None
 
 
 def _from_sensor_resolution(info: ImageInfo) -> float | None:

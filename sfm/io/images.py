@@ -66,20 +66,18 @@ def natural_key(name: str) -> tuple[tuple[tuple[int, int | str], ...], str]:
     return tuple((0, int(part)) if part.isdecimal() else (1, part) for part in parts if part), name
 
 
-def list_images(folder: Path | str, *, exclude: Path | str | None = None) -> ImageListing:
+def list_images(folder: Path | str) -> ImageListing:
     """Finds the images in a folder and below it, by their content rather than by their suffix.
 
     Hidden files and folders are passed over. Links are followed, each folder is visited once.
 
-    Args:
-        exclude: a folder to pass over, e.g. a workspace that lies inside.
     Raises:
         InputError: `folder` is missing, is no folder or may not be read.
     """
     folder = Path(folder)
     _check_folder(folder)
     names, skipped = [], {}
-    for path in _files(folder, exclude):
+    for path in _files(folder):
         name = path.relative_to(folder).as_posix()
         reason = _why_not_listed(path, name)
         if reason:
@@ -92,7 +90,7 @@ def list_images(folder: Path | str, *, exclude: Path | str | None = None) -> Ima
     )
 
 
-def read_image(path: Path | str, *, gray: bool = False, max_size: int | None = None) -> ImageU8:
+def read_image(path: Path | str, *, gray: bool = False) -> ImageU8:
     """The pixels of an image in the frame of its sensor, (H, W, 3) RGB or (H, W) grey, uint8.
 
     Of a file with several pictures the first is read. Transparency is dropped: the colours beneath are what the
@@ -100,9 +98,6 @@ def read_image(path: Path | str, *, gray: bool = False, max_size: int | None = N
     that holds the brightest pixel, since cameras store 12 bits in files of 16; floats must lie in [0, 1]. A
     truncated file is refused although much of it could be decoded, since the rest would be flat grey with a sharp edge.
 
-    Args:
-        max_size: if the longer side is above, the image is reduced by area averaging so that it is this, in px.
-            Then x_full = x · width_full / width, and the same for y; both factors may differ slightly.
     Raises:
         ImageError: the file is missing, empty, truncated, no image, or below `MIN_SIDE_PX`.
     """
@@ -110,10 +105,6 @@ def read_image(path: Path | str, *, gray: bool = False, max_size: int | None = N
     image = _to_8_bits(_decode(read_image_bytes(path), path, gray), path)
     height, width = image.shape[:2]
     check_size(width, height, path)
-    if max_size is not None and max(height, width) > max_size:
-        scale = max_size / max(height, width)
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -155,8 +146,8 @@ def _check_folder(folder: Path) -> None:
         pass
 
 
-def _files(folder: Path, exclude: Path | str | None) -> Iterator[Path]:
-    seen = {os.path.realpath(exclude)} if exclude is not None else set()
+def _files(folder: Path) -> Iterator[Path]:
+    seen: set[str] = set()
     refused: list[OSError] = []
     for where, folders, files in os.walk(folder, followlinks=True, onerror=refused.append):
         real = os.path.realpath(where)

@@ -48,7 +48,7 @@ class MappingConfig:
     """Median angle between the rays of the first pair; relaxed with the matches."""
     init_max_forward: float = 0.95
     """Largest part of the first pair's motion along the optical axis."""
-    init_trials: int = 20
+    init_trials: int = 200
     """First pairs tried for a model."""
     resection_max_error_px: float = 12.0
     """Reprojection error of a point that agrees with a new pose; wide, as the model is not yet adjusted to it."""

@@ -20,7 +20,7 @@ from sfm.core.scene import Features, Matches
 from sfm.matching import _kernels
 
 _BLOCK_ROWS = 256
-"""Rows of the table of distances at a time: 8 MB for 8192 features, which stays in the cache of a core."""
+"""Rows of the table of distances at a time: 12 MB for 12,000 features, which stays in the cache of a core."""
 _DESCRIPTOR_NORM = 512.0
 _EXACT_BELOW = 2**24
 

@@ -7,10 +7,7 @@ number must be that of the images, and they are taken in order: camera ids ascen
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-
-import numpy as np
 
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError
@@ -42,26 +39,12 @@ def assigned_cameras(
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera | None:
-    """The camera of images that were resized to `width` × `height` px as a whole; None where they cannot have been.
-
-    Focal length and principal point grow with the image, as pixel centres are at one half; distortion acts on
-    normalised coordinates and stays.
-    """
+    """The camera of images that were resized to `width` × `height` px as a whole; None where they cannot have been."""
     if (width, height) == (camera.width, camera.height):
         return camera
     if not _is_multiple(camera, width, height):
         return None
-    factors = width / camera.width, height / camera.height
-    params = camera.params.copy()
-    for k, name in enumerate(camera.model_info.param_names):
-        match name:
-            case "f":
-                params[k] *= np.mean(factors)
-            case "fx" | "cx" | "w":
-                params[k] *= factors[0]
-            case "fy" | "cy" | "h":
-                params[k] *= factors[1]
-    return dataclasses.replace(camera, width=width, height=height, params=params)
+    return camera.scaled(width, height)
 
 
 def _is_multiple(camera: Camera, width: int, height: int) -> bool:

@@ -1,5 +1,5 @@
 """Which matches of two images a rigid scene explains, and by which geometry."""
 
-from sfm.verification.two_view import VerificationConfig, verify_pair, verify_pairs
+from sfm.verification.two_view import VerificationConfig, verify_pair
 
-__all__ = ["VerificationConfig", "verify_pair", "verify_pairs"]
+__all__ = ["VerificationConfig", "verify_pair"]

@@ -19,16 +19,13 @@ Sampling of F and of H stops early where they can no longer change the decision.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float64
 
-from sfm.core.arrays import Mask, Matrix3, Points2D
+from sfm.core.arrays import Mask, Matrix3
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.events import SILENT, Observer, PairVerified
-from sfm.core.execution import ordered_map
 from sfm.core.geometry.epipolar import essential_from_fundamental, essential_from_pose, pose_from_essential
 from sfm.core.geometry.homography import decompose_homography
 from sfm.core.geometry.rigid import Rigid3
@@ -102,45 +99,6 @@ def verify_pair(
     ):
         geometry = TwoViewGeometry(PairKind.WATERMARK, geometry.matches)
     return dataclasses.replace(geometry, matches=matches.indices[inliers])
-
-
-def verify_pairs(
-    keypoints: Mapping[int, Points2D],
-    cameras: Mapping[int, Camera],
-    matches: Mapping[tuple[int, int], Matches],
-    config: VerificationConfig = VerificationConfig(),
-    *,
-    seed: int,
-    threads: int = 1,
-    names: Mapping[int, str] | None = None,
-    observer: Observer = SILENT,
-) -> Iterator[tuple[tuple[int, int], TwoViewGeometry | Rejected]]:
-    """`verify_pair` of every pair, in the order of `matches`; the results do not depend on `threads`.
-
-    Args:
-        keypoints, cameras, names: by image id.
-    """
-
-    def verify(pair: tuple[int, int]) -> TwoViewGeometry | Rejected:
-        i, j = pair
-        rng = np.random.default_rng([seed, i, j])
-        return verify_pair(keypoints[i], keypoints[j], matches[pair], cameras[i], cameras[j], config, rng=rng)
-
-    pairs = list(matches)
-    for pair, geometry in zip(pairs, ordered_map(verify, pairs, threads=threads), strict=True):
-        name1, name2 = (names[k] if names else str(k) for k in pair)
-        accepted = isinstance(geometry, TwoViewGeometry)
-        observer(
-            PairVerified(
-                name1=name1,
-                name2=name2,
-                matches=len(matches[pair]),
-                inliers=len(geometry) if accepted else 0,
-                kind=geometry.kind.name.lower() if accepted else "",
-                reason="" if accepted else geometry.reason,
-            )
-        )
-        yield pair, geometry
 
 
 def _classify(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeometry, Mask] | Rejected:

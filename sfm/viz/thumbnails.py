@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from jaxtyping import UInt8
 
@@ -23,21 +21,8 @@ def thumbnail(image: ImageU8, camera: Camera, *, max_size: int = 512) -> tuple[P
     Args:
         image: of any size with the camera's shape; the camera may have been calibrated at another.
     """
-    small = scaled_camera(camera, min(1.0, max_size / max(camera.width, camera.height)))
+    scale = min(1.0, max_size / max(camera.width, camera.height))
+    small = camera.scaled(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     target = undistorted_camera(small)
     picture = resize(image, small.width, small.height)
     return remap(picture, *undistortion_grid(small, target)), target
-
-
-def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The camera of the image resized by `scale`, to whole pixels; its corners stay corners."""
-    width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    params = np.array(camera.params)
-    info = camera.model_info
-    in_x, in_y = width / camera.width, height / camera.height
-    for index in (*info.focal_indices, *info.principal_point_indices):
-        name = info.param_names[index]
-        params[index] *= {"fx": in_x, "cx": in_x, "fy": in_y, "cy": in_y, "f": (in_x + in_y) / 2}[name]
-    if info.param_names[:2] == ("w", "h"):
-        params = np.array([width, height], dtype=np.float64)
-    return dataclasses.replace(camera, width=width, height=height, params=params)

@@ -13,7 +13,7 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.robust import RansacConfig
 from sfm.core.scene import Matches, PairKind, TwoViewGeometry
-from sfm.verification import VerificationConfig, verify_pair, verify_pairs
+from sfm.verification import VerificationConfig, verify_pair
 
 PINHOLE = Camera("PINHOLE", 1600, 1200, np.array([1300.0, 1290, 800, 600]), True)
 RADIAL = Camera("RADIAL", 1600, 1200, np.array([1300.0, 800, 600, -0.15, 0.02]), True)
@@ -203,45 +203,6 @@ def test_the_kind_does_not_depend_on_the_scale_of_the_pixels():
     two = verify_pair(2 * p1, 2 * p2, matches, big, big, double, rng=np.random.default_rng(5))
     assert one.kind == two.kind
     assert abs(len(one) - len(two)) <= 3
-
-
-def _batch():
-    keypoints, matches = {}, {}
-    for k in range(4):
-        p1, p2, pair, _ = _pair(PINHOLE, seed=k, plane=k == 2, count=120)
-        keypoints[2 * k], keypoints[2 * k + 1] = p1, p2
-        matches[2 * k, 2 * k + 1] = pair
-    keypoints[9] = keypoints[8] = np.zeros((3, 2))
-    matches[8, 9] = Matches(np.zeros((2, 2), np.int32))
-    return keypoints, dict.fromkeys(keypoints, PINHOLE), matches
-
-
-def test_results_do_not_depend_on_the_number_of_threads_nor_on_the_other_pairs():
-    keypoints, cameras, matches = _batch()
-    runs = [dict(verify_pairs(keypoints, cameras, matches, seed=7, threads=n)) for n in (1, 2, 3)]
-    alone = dict(verify_pairs(keypoints, cameras, {(4, 5): matches[4, 5]}, seed=7))
-    assert list(runs[0]) == list(matches)
-    for run in (*runs[1:], alone):
-        for pair, found in run.items():
-            first = runs[0][pair]
-            if isinstance(first, Rejected):
-                assert found == first
-                continue
-            np.testing.assert_array_equal(found.matches, first.matches)
-            np.testing.assert_array_equal(found.cam2_from_cam1.matrix, first.cam2_from_cam1.matrix)
-            assert found.kind == first.kind
-
-
-def test_every_pair_is_reported_with_its_kind_or_reason():
-    keypoints, cameras, matches = _batch()
-    events = []
-    names = {k: f"{k}.jpg" for k in keypoints}
-    found = dict(verify_pairs(keypoints, cameras, matches, seed=7, names=names, observer=events.append))
-    assert [type(event) for event in events] == [PairVerified] * 5
-    assert (events[0].name1, events[0].name2) == ("0.jpg", "1.jpg")
-    assert events[0].inliers == len(found[0, 1])
-    assert events[2].kind == "planar"
-    assert events[4].reason == "too_few_matches"
 
 
 def test_a_homography_of_undistorted_pixels_maps_them():
