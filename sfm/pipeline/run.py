@@ -26,7 +26,7 @@ from sfm.pipeline.observers import LogFiles, watched
 from sfm.pipeline.report import RunReport, figures_of, no_model_error
 from sfm.pipeline.scene import Scene, read_scene
 from sfm.pipeline.stages import Run, extract_all, match_all, verify_all
-from sfm.pipeline.warm_up import kernels_compiled_ahead
+from sfm.pipeline.warm_up import compile_kernels
 
 
 def reconstruct(
@@ -62,11 +62,11 @@ def reconstruct(
         # Only now: settings that do not fit the photos must not be kept for the next run.
         write_text(workspace / "sfm.toml", to_toml(config))
         run = Run(database, config, threads, tell, scene.images)
-        with kernels_compiled_ahead(tell, calibrated=run.calibrated):
-            feature_keys = extract_all(run)
-            match_keys = match_all(run, feature_keys)
-            pair_keys = verify_all(run, match_keys)
-            models, model_key = map_all(run, pair_keys, workspace / "sparse")
+        compile_kernels(tell, threads=threads)
+        feature_keys = extract_all(run)
+        match_keys = match_all(run, feature_keys)
+        pair_keys = verify_all(run, match_keys)
+        models, model_key = map_all(run, pair_keys, workspace / "sparse")
 
         if not models:
             (workspace / "manifest.json").unlink(missing_ok=True)  # of a run before, whose models are gone

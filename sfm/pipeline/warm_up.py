@@ -1,19 +1,21 @@
-"""Compiling the kernels while photos are read.
+"""Compiling the kernels before the first run.
 
-On the first run every stage would wait for its kernels, about as long as it takes to match a hundred pairs. Compiling
-keeps one core busy and features and matches mostly leave the interpreter alone, so one thread compiles ahead of the
-stages: it takes them in their order through a made-up scene of a few cameras, whose results are thrown away. What it
-has not reached when a stage comes is compiled there and then. Nothing that a run computes depends on it.
+numba compiles under one lock for all threads of a process, so a second thread gains nothing. Two processes fill the
+cache that the run then reads from: one takes a made-up pair of photos through matching and verification, the other a
+made-up scene through mapping. Nothing that a run computes depends on them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import gc
+import itertools
 import os
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,115 +26,133 @@ from sfm.core.errors import Rejected
 from sfm.core.events import Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from sfm.core.scene import Features, Matches, Reconstruction, TwoViewGeometry, ViewGraph
+from sfm.core.scene import Features, Matches, PairKind, Reconstruction, TwoViewGeometry, ViewGraph
+from sfm.io.colmap_model import write_model
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
 from sfm.matching import match_features
 from sfm.verification import verify_pair
 
 _IMAGES, _POINTS, _STRAYS = 6, 240, 24
+_COMPILE = "import sys; from sfm.pipeline.warm_up import run_parts; run_parts(sys.argv[1:])"
 
 
-@contextlib.contextmanager
-def kernels_compiled_ahead(observer: Observer, *, calibrated: bool) -> Iterator[None]:
-    """While kernels are missing in numba's cache: says so, compiles them on a thread, and notes when all are there.
+def compile_kernels(observer: Observer, *, threads: int) -> None:
+    """Compiles what numba's cache lacks, and says so before and after; at once done if it lacks nothing.
 
-    The thread ends with the block, at the latest when the step that it is at is done. A failure of it is told as a
-    warning: the kernels that the run itself needs were compiled by the stages then.
+    A failure is told as a warning: the stages compile what they need by themselves then.
 
     Args:
-        calibrated: focal lengths are known, so that this kind of verification will be needed.
+        threads: with one, the parts are compiled one after the other.
     """
     folder = os.environ.get("NUMBA_CACHE_DIR")
-    if folder is None or is_complete(Path(folder)):
-        yield
+    if folder is None or is_complete(Path(folder)) or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
         return
-    observer(Note(message="compiling kernels (first run only), about 25 seconds, partly beside the first stages"))
-    compiles = os.environ.get("NUMBA_DISABLE_JIT", "0") == "0"
-    steps = _steps(calibrated) if compiles else []
-    with _rare_garbage_collection(), _in_background(steps, observer) as done:
-        yield
-    if compiles and len(done) == len(steps):
-        mark_complete(Path(folder))
+    observer(Note(message="compiling kernels (first run only), about 20 seconds on two cores"))
+    began = time.perf_counter()
+    parts = list(_PARTS)
+    failures = _in_processes([parts] if threads == 1 else [[part] for part in parts])
+    if failures:
+        message = f"compiling ahead failed, so the stages will take longer: {'; '.join(failures)}"
+        observer(Note(message=message, level="warning"))
+        return
+    mark_complete(Path(folder))
+    observer(Note(message=f"kernels compiled in {time.perf_counter() - began:.0f} s"))
 
 
-@contextlib.contextmanager
-def _in_background(steps: Sequence[Callable[[], object]], observer: Observer) -> Iterator[list[int]]:
-    """Takes the steps on a thread, and tells which are done; leaves out those that are left when the block ends."""
-    over = threading.Event()
-    done: list[int] = []
+def _in_processes(shares: Sequence[Sequence[str]]) -> list[str]:
+    """Runs each share of the parts in a process of its own, all at once; the last words of those that fail.
 
-    def take() -> None:
-        for number, step in enumerate(steps):
-            if not over.is_set():
-                step()
-                done.append(number)
-
-    with ThreadPoolExecutor(1, thread_name_prefix="warm-up") as pool:
-        work = pool.submit(take)
-        try:
-            yield done
-        finally:
-            over.set()
-    if (error := work.exception()) is not None:
-        observer(Note(message=f"compiling ahead failed: {type(error).__name__}: {error}", level="warning"))
-
-
-@contextlib.contextmanager
-def _rare_garbage_collection() -> Iterator[None]:
-    """Compilation makes many objects that live long: looking through them again and again is a tenth of its time."""
-    before = gc.get_threshold()
-    gc.set_threshold(100_000, *before[1:])
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
+    The processes import what this one would, and none outlives the call.
+    """
+    path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
+    environment = {**os.environ, "PYTHONPATH": path}
+    with contextlib.ExitStack() as stack:
+        workers = []
+        for share in shares:
+            command = [sys.executable, "-P", "-c", _COMPILE, *share]
+            worker = subprocess.Popen(
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+            )
+            stack.enter_context(worker)
+            stack.callback(worker.kill)
+            workers.append(worker)
+        said = [worker.communicate()[1].decode(errors="replace").strip() for worker in workers]
+        outcomes = zip(workers, said, strict=True)
+        return [
+            words.splitlines()[-1] if words else f"exit code {worker.returncode}"
+            for worker, words in outcomes
+            if worker.returncode != 0
+        ]
 
 
-def _steps(calibrated: bool) -> list[Callable[[], object]]:
-    """In the order of the stages."""
-    return [_match, lambda: _verified(calibrated, pairs=1), lambda: _map(calibrated)]
+def run_parts(names: Sequence[str]) -> None:
+    """Takes the made-up scene through these parts of the pipeline."""
+    # Compilation makes many objects that live long: looking through them again and again is a tenth of its time.
+    gc.set_threshold(100_000)
+    for name in names:
+        _PARTS[name]()
 
 
-def _match() -> None:
+def _pair() -> None:
+    """Matching and verification of two images, with known and with unknown focal lengths."""
     descriptors = np.random.default_rng(0).integers(0, 90, (8, 128), dtype=np.uint8)
     zeros = np.zeros(8, np.float32)
     features = Features(np.zeros((8, 2)), zeros, zeros, descriptors)
     match_features(features, features)
+    for calibrated in (True, False):
+        _verified(calibrated)
 
 
-def _verified(calibrated: bool, pairs: int) -> ViewGraph:
-    """The first `pairs` of the made-up scene."""
-    camera, keypoints = _camera(calibrated), _keypoints()
-    matches = Matches(np.stack([np.arange(_POINTS, dtype=np.int32)] * 2, axis=1))
-    found: dict[tuple[int, int], TwoViewGeometry] = {}
-    for i, j in [(i, j) for i in keypoints for j in keypoints if i < j][:pairs]:
-        rng = np.random.default_rng([i, j])
-        geometry = verify_pair(keypoints[i], keypoints[j], matches, camera, camera, rng=rng)
-        if not isinstance(geometry, Rejected):
-            found[i, j] = geometry
-    return ViewGraph(found)
+def _verified(calibrated: bool) -> TwoViewGeometry | Rejected:
+    keypoints, camera = _keypoints(), _camera(calibrated)
+    return verify_pair(keypoints[1], keypoints[2], _matches(), camera, camera, rng=np.random.default_rng(0))
 
 
-def _map(calibrated: bool) -> list[Reconstruction]:
-    graph, keypoints = _verified(calibrated, pairs=_IMAGES**2), _keypoints()
+def _models() -> list[Reconstruction]:
+    """Mapping of the scene from the true poses of its pairs, written to disk once."""
+    keypoints = _keypoints()
+    graph = ViewGraph(
+        {
+            (i, j): TwoViewGeometry(
+                PairKind.CALIBRATED, _matches().indices, cam2_from_cam1=_pose(j) @ _pose(i).inverse(), tri_angle=0.15
+            )
+            for i, j in itertools.combinations(keypoints, 2)
+        }
+    )
     owners, names = dict.fromkeys(keypoints, 1), {k: str(k) for k in keypoints}
-    return map_incrementally(graph, keypoints, {1: _camera(calibrated)}, owners, names)
+    models = map_incrementally(graph, keypoints, {1: _camera(False)}, owners, names)
+    with tempfile.TemporaryDirectory() as folder:
+        for model in models:
+            write_model(model, Path(folder))
+    return models
+
+
+_PARTS = {"pair": _pair, "models": _models}
 
 
 def _camera(calibrated: bool) -> Camera:
     return Camera("SIMPLE_RADIAL", 800, 600, np.array([700.0, 400.0, 300.0, 0.01]), calibrated)
 
 
+def _pose(image: int) -> Rigid3:
+    """On an arc around the points."""
+    turn = Rotation3.exp(np.array([0.0, 0.15 * image, 0.02 * image]))
+    return Rigid3(turn, np.array([0.0, 0.0, 5.0]))
+
+
+def _matches() -> Matches:
+    return Matches(np.stack([np.arange(_POINTS, dtype=np.int32)] * 2, axis=1))
+
+
 def _keypoints() -> dict[int, Points2D]:
-    """Points of a ball as cameras on an arc around it see them, to within noise, and a few that belong to nothing."""
+    """Points of a ball as the cameras see them, to within noise, and a few that belong to nothing."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (_POINTS, 3))
     keypoints: dict[int, Points2D] = {}
-    for k in range(_IMAGES):
-        turn = Rotation3.exp(np.array([0.0, 0.15 * k, 0.02 * k]))
-        pixels, _ = _camera(True).project(Rigid3(turn, np.array([0.0, 0.0, 5.0])) @ points)
+    for image in range(1, _IMAGES + 1):
+        pixels, _ = _camera(True).project(_pose(image) @ points)
         pixels += rng.normal(0, 0.3, pixels.shape)
         pixels[rng.permutation(_POINTS)[:_STRAYS]] = rng.uniform(100, 500, (_STRAYS, 2))
-        keypoints[k + 1] = pixels
+        keypoints[image] = pixels
     return keypoints
