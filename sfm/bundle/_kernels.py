@@ -30,7 +30,7 @@ def squared_errors(image, point, observed, camera, model_ids, params, R, t, X, o
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def linearize(
-    first, last, offsets, image, observed, coupling, point_free, camera, model_ids, columns, pose_slot,
+    first, last, offsets, image, observed, precision, coupling, point_free, camera, model_ids, columns, pose_slot,
     R, t, params, X, loss, scale, lost_cost, H, F, h, V, g, W, B,
 ):  # fmt: skip
     """Cost ½ Σ ρ of the points `first:last`, and the blocks of their normal equations.
@@ -57,11 +57,13 @@ def linearize(
                 cost += lost_cost
                 W[o, :, :] = 0.0
                 continue
-            eu, ev = u - observed[o, 0], v - observed[o, 1]
+            root = precision[o]
+            eu, ev = (u - observed[o, 0]) * root, (v - observed[o, 1]) * root
             rho, weight = loss_and_weight(loss, scale, eu * eu + ev * ev)
             cost += 0.5 * rho
-            root = math.sqrt(weight)
-            eu, ev = eu * root, ev * root
+            weight = math.sqrt(weight)
+            eu, ev = eu * weight, ev * weight
+            root *= weight
             a0, a1, a2 = A[0, 0] * root, A[0, 1] * root, A[0, 2] * root
             b0, b1, b2 = A[1, 0] * root, A[1, 1] * root, A[1, 2] * root
             # exp(δ) x = x + ω × x + υ to first order, and a · (ω × x) = ω · (x × a).
@@ -108,7 +110,7 @@ def linearize(
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def try_points(
-    first, last, offsets, image, observed, starts, slot, coupling_offsets, coupling_slot, camera, model_ids,
+    first, last, offsets, image, observed, precision, starts, slot, coupling_offsets, coupling_slot, camera, model_ids,
     R, t, params, X, loss, scale, lost_cost, damping, M, V, g, W, B, pose_delta, camera_delta, moved, totals,
 ):  # fmt: skip
     """Steps of the points `first:last` by back-substitution, and the cost where everything has moved.
@@ -151,7 +153,7 @@ def try_points(
                 z = r[2, 0] * x0 + r[2, 1] * x1 + r[2, 2] * x2 + t[i, 2]
                 u, v, ok = project_point(model_ids[c], params[c], x, y, z)
                 if ok:
-                    eu, ev = u - observed[o, 0], v - observed[o, 1]
+                    eu, ev = (u - observed[o, 0]) * precision[o], (v - observed[o, 1]) * precision[o]
                     rho, _ = loss_and_weight(loss, scale, eu * eu + ev * ev)
                     here += 0.5 * rho
                 else:

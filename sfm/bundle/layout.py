@@ -46,6 +46,7 @@ class Layout:
     image: np.ndarray
     point: np.ndarray
     observed: np.ndarray
+    precision: np.ndarray
     pose_slot: np.ndarray
     slot_image: np.ndarray
     image_slot: np.ndarray
@@ -96,6 +97,7 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         image=image,
         point=point.astype(np.int32),
         observed=problem.obs_points2D[active][order],
+        precision=_precision(problem, active)[order],
         pose_slot=pose_slot,
         slot_image=slot_image,
         image_slot=image_slot,
@@ -112,6 +114,11 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         jobs=_jobs(eliminated, slots[eliminated], work, copies, stripes),
         coupling_jobs=_jobs(coupled, coupling_slot, coupling_work, copies, stripes),
     )
+
+
+def _precision(problem: BundleProblem, active: np.ndarray) -> np.ndarray:
+    """1 / σ of the active observations."""
+    return np.ones(int(active.sum())) if problem.obs_sigmas_px is None else 1 / problem.obs_sigmas_px[active]
 
 
 def _number(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

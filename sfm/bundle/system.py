@@ -111,7 +111,7 @@ class BundleSystem:
         def chunk(job: tuple[int, tuple[int, int]]) -> float:
             k, (first, last) = job
             return kernels.linearize(
-                first, last, lay.offsets, lay.image, lay.observed, lay.obs_coupling, self._free_points,
+                first, last, lay.offsets, lay.image, lay.observed, lay.precision, lay.obs_coupling, self._free_points,
                 self._image_cameras, self._model_ids, lay.columns, lay.pose_slot,
                 now.rotations, now.translations, now.params, now.points3D, *self._loss,
                 self._H[k], self._F[k], self._h[k], self._V, self._g, self._W, self._B,
@@ -143,7 +143,7 @@ class BundleSystem:
         def chunk(job: tuple[int, tuple[int, int]]) -> None:
             k, (first, last) = job
             kernels.try_points(
-                first, last, lay.offsets, lay.image, lay.observed, lay.starts, lay.obs_slot,
+                first, last, lay.offsets, lay.image, lay.observed, lay.precision, lay.starts, lay.obs_slot,
                 lay.coupling_offsets, lay.coupling_slot, self._image_cameras, self._model_ids,
                 then.rotations, then.translations, then.params, now.points3D, *self._loss,
                 damping, self._M, self._V, self._g, self._W, self._B, pose_delta, camera_delta,
