@@ -18,16 +18,20 @@ from datasets.synthetic.render import Renderer, Rendering
 from datasets.synthetic.sensor import SensorConfig, encode, expose
 from datasets.synthetic.truth import reconstruction
 from datasets.synthetic.world import Scene
+from sfm.core.execution import available_threads, ordered_map
 from sfm.io.colmap_model import write_model
 
 
 def photos(
-    scene: Scene, renderer: Renderer, sensor: SensorConfig, *, seed: int = 0
+    scene: Scene, renderer: Renderer, sensor: SensorConfig, *, seed: int = 0, threads: int = 1
 ) -> Iterator[tuple[Rendering, np.ndarray]]:
-    """Each view's rendering and photo (H, W, 3) uint8, in the order of the views."""
-    for row, view in enumerate(scene.views):
-        rendering = renderer.view(view)
-        yield rendering, expose(rendering.radiance, sensor, np.random.default_rng([seed, row, 12]))
+    """Each view's rendering and photo (H, W, 3) uint8, in the order of the views, `threads` of them at once."""
+
+    def take(row: int) -> tuple[Rendering, np.ndarray]:
+        rendering = renderer.view(scene.views[row])
+        return rendering, expose(rendering.radiance, sensor, np.random.default_rng([seed, row, 12]))
+
+    yield from ordered_map(take, range(len(scene.views)), threads=threads, ahead=0)
 
 
 def write_scene(
@@ -45,12 +49,15 @@ def write_scene(
 
     Args:
         maps: depth and normals are written, too.
-        samples, threads: see `Renderer`.
+        samples: see `Renderer`.
+        threads: views at once; all cores by default.
         points_per_image: pixels of each view from which true points are taken.
     """
     folder = Path(folder)
-    renderer = Renderer(scene.world, threads=threads, samples=samples)
-    for view, (rendering, photo) in zip(scene.views, photos(scene, renderer, sensor, seed=seed), strict=True):
+    # A view for each thread: what a single view does in sequence would leave the other cores idle.
+    renderer = Renderer(scene.world, threads=1, samples=samples)
+    taken = photos(scene, renderer, sensor, seed=seed, threads=threads or available_threads())
+    for view, (rendering, photo) in zip(scene.views, taken, strict=True):
         _write(folder / "images" / (view.name + sensor.suffix), encode(photo, sensor))
         if maps:
             _write_array(folder / "truth/depth" / (view.name + ".npy"), rendering.depth.astype(np.float32))
