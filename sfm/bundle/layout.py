@@ -118,7 +118,7 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
 
 def _precision(problem: BundleProblem, active: np.ndarray) -> np.ndarray:
     """1 / σ of the active observations."""
-    return np.ones(int(active.sum())) if problem.obs_sigmas_px is None else 1 / problem.obs_sigmas_px[active]
+    return np.ones(int(active.sum())) if problem.obs_sigmas is None else 1 / problem.obs_sigmas[active]
 
 
 def _number(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

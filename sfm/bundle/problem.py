@@ -29,6 +29,8 @@ class BundleProblem(Value):
         obs_points2D: (n, 2) px.
         free_params: (C, 12) which camera parameters may change; padding must be False.
         free_poses, free_points: (I,) and (P,).
+        obs_sigmas: (n,) standard deviations by which residuals are divided: in px, or up to a common factor; None is 1
+            for all.
         prior_params, prior_sigmas: (C, 12) what free camera parameters are expected to be, and the standard deviation
             of that; inf expects nothing, and so does None for all.
 
@@ -50,7 +52,7 @@ class BundleProblem(Value):
     free_points: Bool[np.ndarray, " P"]
     prior_params: Float64[np.ndarray, "C K"] | None = None
     prior_sigmas: Float64[np.ndarray, "C K"] | None = None
-    obs_sigmas_px: Float64[np.ndarray, " n"] | None = None
+    obs_sigmas: Float64[np.ndarray, " n"] | None = None
 
     def __post_init__(self) -> None:
         cameras, images = len(self.model_ids), len(self.image_cameras)
@@ -75,10 +77,10 @@ class BundleProblem(Value):
                 object.__setattr__(self, name, readonly(getattr(self, name), (cameras, MAX_PARAMS)))
         if self.prior_sigmas is not None and not np.all(self.prior_sigmas > 0):
             raise ValueError("prior_sigmas must be positive")
-        if self.obs_sigmas_px is not None:
-            object.__setattr__(self, "obs_sigmas_px", readonly(self.obs_sigmas_px, (observations,), np.float64))
-            if not np.all((self.obs_sigmas_px > 0) & np.isfinite(self.obs_sigmas_px)):
-                raise ValueError("obs_sigmas_px must be positive and finite")
+        if self.obs_sigmas is not None:
+            object.__setattr__(self, "obs_sigmas", readonly(self.obs_sigmas, (observations,), np.float64))
+            if not np.all((self.obs_sigmas > 0) & np.isfinite(self.obs_sigmas)):
+                raise ValueError("obs_sigmas must be positive and finite")
         if self.cams_from_world.shape != (images,):
             raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
         _check_rows("image_cameras", self.image_cameras, cameras)

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm.core.arrays import Points2D
+from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera, model_by_id
 from sfm.core.errors import FormatError, Rejected
 from sfm.core.scene import Features, Matches, TwoViewGeometry, ViewGraph
@@ -241,6 +241,14 @@ class Database(Bookkeeping):
             ValueError: the image has none.
         """
         return self._keypoints(image_id)[:, :2].astype(np.float64)
+
+    def read_keypoint_scales(self, image_id: int) -> FloatArray:
+        """Only the scales of an image's features, in px; 0 where the database has none.
+
+        Raises:
+            ValueError: the image has none.
+        """
+        return rows_.scales_and_orientations(self._keypoints(image_id))[0].astype(np.float64)
 
     def feature_counts(self) -> dict[int, int]:
         """Number of features of every image that has been through extraction, 0 included."""

@@ -6,20 +6,33 @@ import dataclasses
 
 import numpy as np
 
-from sfm.bundle import BundleConfig, BundleProblem, adjust
+from sfm.bundle import BundleConfig, BundleProblem, adjust, squared_errors
 from sfm.core.events import Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
+from sfm.mapping.noise import learn_sigmas
 from sfm.mapping.state import State
 
 _SHORT_TRACK = 15
 """Tracks up to this length are adjusted with a neighbourhood even where they reach beyond it; longer ones are firm."""
+_LOSS_SIGMAS = 3.0
+"""Residual, in standard deviations, beyond which it is rather an outlier."""
 
 
 def adjust_globally(
-    state: State, config: BundleConfig, *, free_params: np.ndarray, threads: int, observer: Observer
+    state: State,
+    config: BundleConfig,
+    *,
+    free_params: np.ndarray,
+    threads: int,
+    observer: Observer,
+    weighted: bool = False,
 ) -> None:
-    """Adjusts all poses and points, and the camera parameters that `free_params` (C, 12) marks."""
+    """Adjusts all poses and points, and the camera parameters that `free_params` (C, 12) marks.
+
+    Args:
+        weighted: each residual counts as much as keypoints of its scale have proved precise, see `noise`.
+    """
     rows = np.flatnonzero(state.on)
     _adjust(
         state,
@@ -31,6 +44,7 @@ def adjust_globally(
         threads=threads,
         observer=observer,
         scope="global",
+        weighted=weighted,
     )
 
 
@@ -83,6 +97,7 @@ def _adjust(
     threads: int,
     observer: Observer,
     scope: str,
+    weighted: bool = False,
 ) -> None:
     """Gathers the observations `rows` with the images, cameras and points that they touch, and writes the result."""
     scene = state.scene
@@ -104,12 +119,30 @@ def _adjust(
         prior_params=scene.expected_params[cameras],
         prior_sigmas=scene.param_sigmas[cameras],
     )
+    if weighted:
+        problem, config = _weighted(problem, config, scene.scale[rows])
     result = adjust(problem, config, threads=threads, observer=observer, scope=scope).problem
     state.R[images], state.t[images] = result.cams_from_world.rotation.matrix, result.cams_from_world.translation
     state.points[tracks] = result.points3D
     moved = np.flatnonzero(np.any(state.params[cameras] != result.camera_params, axis=1))
     state.params[cameras] = result.camera_params
     state.refresh_rays(cameras[moved].tolist())
+
+
+def _weighted(problem: BundleProblem, config: BundleConfig, scales: np.ndarray) -> tuple[BundleProblem, BundleConfig]:
+    """With standard deviations for the observations, 1 in the median: so residuals still are px, as the loss has them.
+
+    The loss turns linear at `_LOSS_SIGMAS` standard deviations, if that is below the configured scale.
+    """
+    if not len(scales):
+        return problem, config
+    views = np.bincount(problem.obs_points, minlength=len(problem.points3D))[problem.obs_points]
+    sigmas = learn_sigmas(np.sqrt(squared_errors(problem)), scales, views.astype(np.float64))
+    typical = float(np.median(sigmas))
+    return (
+        dataclasses.replace(problem, obs_sigmas=sigmas / typical),
+        dataclasses.replace(config, loss_scale_px=min(config.loss_scale_px, _LOSS_SIGMAS * typical)),
+    )
 
 
 def neighbourhood(state: State, image: int, count: int, min_angle: float) -> np.ndarray:

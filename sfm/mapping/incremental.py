@@ -21,7 +21,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sfm.bundle import BundleConfig
-from sfm.core.arrays import Points2D
+from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, ImageRegistered, Note, Observer
@@ -100,6 +100,7 @@ def map_incrementally(
     image_names: Mapping[int, str],
     config: MappingConfig = MappingConfig(),
     *,
+    keypoint_scales: Mapping[int, FloatArray] | None = None,
     seed: int = 0,
     threads: int = 1,
     refine_intrinsics: bool = True,
@@ -111,6 +112,7 @@ def map_incrementally(
         keypoints: by image id, in px; the rows are what the matches of `view_graph` count.
         cameras: by camera id. Their focal lengths and distortions are refined unless `refine_intrinsics` is false.
         image_cameras: camera id of each image id.
+        keypoint_scales: by image id, in px, row by row with `keypoints`: how precise each scale is will be learnt.
         seed: of the resections' random samples.
         threads: changes the time, not the result.
     """
@@ -120,7 +122,7 @@ def map_incrementally(
 
     def grow(graph: ViewGraph) -> list[Reconstruction]:
         tracks = build_tracks(graph, keypoints, min_length=2)
-        scene = Scene.build(tracks, keypoints, cameras, image_cameras, image_names)
+        scene = Scene.build(tracks, keypoints, cameras, image_cameras, image_names, keypoint_scales)
         return _Mapper(scene, graph, config, seed, threads, refine_intrinsics, observer).grow_models()
 
     models = grow(view_graph)
@@ -274,7 +276,10 @@ class _Mapper:
             if np.sum(state.on != before) <= 0.0005 * np.sum(before):
                 break
         if final:
-            self.adjust_all(state, dataclasses.replace(bundle, relative_cost_tolerance=1e-8), principal_points=True)
+            exact = dataclasses.replace(bundle, relative_cost_tolerance=1e-8)
+            self.adjust_all(state, bundle, principal_points=True)
+            for _ in range(2):  # better poses show the noise better
+                self.adjust_all(state, exact, principal_points=True, weighted=True)
             state.filter(np.arange(len(state.has_point)), config.max_error_px, min_angle)
 
     def drop_lost_images(self, state: State) -> None:
@@ -284,17 +289,25 @@ class _Mapper:
             state.unregister(image)
             self.tell(state, image, Rejected("lost_observations", f"{views[image]} of its observations still fit"))
 
-    def adjust_all(self, state: State, bundle: BundleConfig, *, principal_points: bool = False) -> None:
+    def adjust_all(
+        self, state: State, bundle: BundleConfig, *, principal_points: bool = False, weighted: bool = False
+    ) -> None:
         """Adjusts everything; a camera that this drives out of bounds goes back and is held."""
         free = self.free_params(state, principal_points)
         before = state.copy()
-        adjust_globally(state, bundle, free_params=free, threads=self.threads, observer=self.observer)
+
+        def adjust() -> None:
+            adjust_globally(
+                state, bundle, free_params=free, threads=self.threads, observer=self.observer, weighted=weighted
+            )
+
+        adjust()
         bogus = [row for row in np.flatnonzero(free.any(1)).tolist() if has_bogus_params(state, row)]
         if bogus:
             for name in ("params", "ray", "R", "t", "points"):
                 setattr(state, name, getattr(before, name))
             free[bogus] = False
-            adjust_globally(state, bundle, free_params=free, threads=self.threads, observer=self.observer)
+            adjust()
 
     def free_params(self, state: State, principal_points: bool) -> np.ndarray:
         """Which parameters (C, 12) are adjusted.

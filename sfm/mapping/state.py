@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from sfm.core.arrays import Points2D
+from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -53,7 +53,8 @@ class Scene:
         image_ids, image_names, sizes: of each image row; sizes (I, 2) px.
         camera_ids, cameras, image_camera: cameras as they came, and each image's row among them.
         expected_params, param_sigmas: (C, 12) what their parameters are expected to be, and how closely.
-        offsets, image, feature, xy: tracks as flat columns, `image` as rows.
+        offsets, image, feature, xy, scale: tracks as flat columns, `image` as rows; scales of keypoints in px, 0 where
+            they are unknown.
         track_of: the track of each observation.
         image_offsets, image_observations: the observations of each image, CSR.
     """
@@ -71,6 +72,7 @@ class Scene:
     image: np.ndarray
     feature: np.ndarray
     xy: np.ndarray
+    scale: np.ndarray
     track_of: np.ndarray
     image_offsets: np.ndarray
     image_observations: np.ndarray
@@ -82,6 +84,7 @@ class Scene:
         cameras: Mapping[int, Camera],
         image_cameras: Mapping[int, int],
         image_names: Mapping[int, str],
+        keypoint_scales: Mapping[int, FloatArray] | None = None,
     ) -> Scene:
         """Lays the inputs out in rows."""
         ids = np.array(sorted(image_cameras), np.int32)
@@ -91,7 +94,10 @@ class Scene:
         image = np.searchsorted(ids, tracks.image_ids).astype(np.int32)
         counts = np.array([len(keypoints[i]) for i in ids.tolist()], np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
-        xy = np.concatenate([keypoints[i] for i in ids.tolist()])[starts[image] + tracks.feature_ids]
+        rows = starts[image] + tracks.feature_ids
+        xy = np.concatenate([keypoints[i] for i in ids.tolist()])[rows]
+        scales = keypoint_scales or {i: np.zeros(len(keypoints[i])) for i in ids.tolist()}
+        scale = np.concatenate([scales[i] for i in ids.tolist()])[rows]
         expected, sigmas = expected_intrinsics(used)
         return Scene(
             image_ids=ids,
@@ -107,6 +113,7 @@ class Scene:
             image=image,
             feature=np.array(tracks.feature_ids),
             xy=np.ascontiguousarray(xy, dtype=np.float64),
+            scale=scale,
             track_of=tracks.track_ids,
             image_offsets=np.concatenate([[0], np.cumsum(np.bincount(image, minlength=len(ids)))]),
             image_observations=np.argsort(image, kind="stable"),

@@ -71,6 +71,7 @@ def _map(run: Run) -> list[Reconstruction]:
         image_cameras,
         {image_id: image.name for image_id, image in used.items()},
         config.mapping,
+        keypoint_scales={image_id: database.read_keypoint_scales(image_id) for image_id in used},
         seed=config.seed,
         threads=run.threads,
         refine_intrinsics=refines_intrinsics(run),

@@ -74,6 +74,23 @@ def test_the_costs_are_those_of_the_problems(make_problem, perturbed, rng):
     assert len(result.table) == result.iterations + 1
 
 
+def test_an_observation_of_half_the_variance_counts_as_the_same_one_twice(make_problem, perturbed, rng):
+    start = perturbed(make_problem(rng, noise_px=1.0), rng)
+    count = len(start.obs_images)
+    precise = np.arange(count) % 3 == 0
+    weighted = dataclasses.replace(start, obs_sigmas=np.where(precise, np.sqrt(0.5), 1.0))
+    rows = np.concatenate([np.arange(count), np.flatnonzero(precise)])
+    doubled = dataclasses.replace(
+        start, obs_images=start.obs_images[rows], obs_points=start.obs_points[rows],
+        obs_points2D=start.obs_points2D[rows],
+    )  # fmt: skip
+    one, two, plain = (adjust(problem, TIGHT) for problem in (weighted, doubled, start))
+    assert one.final_cost == pytest.approx(two.final_cost, rel=1e-9)
+    shapes = [relative_poses(result.problem)[1] for result in (one, two, plain)]
+    np.testing.assert_allclose(shapes[0], shapes[1], atol=1e-6)
+    assert np.abs(shapes[0] - shapes[2]).max() > 1e-4
+
+
 def test_the_minimum_is_stationary(make_problem, perturbed, rng):
     result = adjust(perturbed(make_problem(rng, noise_px=1.0, model="SIMPLE_RADIAL", free_params=(0, 3)), rng), TIGHT)
     best = result.problem

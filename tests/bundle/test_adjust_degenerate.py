@@ -173,6 +173,9 @@ def test_a_point_that_would_pass_through_a_camera_does_not_stop_the_rest(make_pr
         {"obs_points": np.array([0, -1], np.int32)},
         {"obs_points2D": np.zeros((2, 3))},
         {"free_poses": np.ones(3, bool)},
+        {"obs_sigmas": np.array([1.0, 0.0])},
+        {"obs_sigmas": np.array([1.0, np.inf])},
+        {"obs_sigmas": np.ones(3)},
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(make_problem, rng, change):

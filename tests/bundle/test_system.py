@@ -48,7 +48,7 @@ class Slow:
             camera = Camera(info.name, 1000, 760, problem.camera_params[c, : len(info.param_names)])
             mine = problem.image_cameras[problem.obs_images] == c
             out[mine] += camera.project(in_camera[mine])[0]
-        return out
+        return out if problem.obs_sigmas is None else out / problem.obs_sigmas[:, None]
 
     def cost(self, delta):
         return 0.5 * evaluate_loss(self.loss, np.sum(self.residuals(delta) ** 2, 1))[0].sum()
@@ -90,7 +90,8 @@ def parts(system):
 
 @pytest.fixture(params=["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "EUCM"])
 def mixed(request, make_problem, perturbed, rng):
-    """Two cameras with different free parameters, an image and some points constant, an image seeing a point twice."""
+    """Two cameras with different free parameters, an image and some points constant, an image seeing a point twice,
+    and observations of different precision."""
     problem = make_problem(rng, images=4, points=12, model=request.param, cameras=2, noise_px=1.0, seen=0.9)
     names = model_by_id(int(problem.model_ids[0])).param_names
     free = problem.free_params.copy()
@@ -104,7 +105,8 @@ def mixed(request, make_problem, perturbed, rng):
         obs_points=np.append(problem.obs_points, problem.obs_points[:3]),
         obs_points2D=np.concatenate([problem.obs_points2D, problem.obs_points2D[:3] + 0.5]),
     )
-    return perturbed(problem, rng, 0.003)
+    sigmas = rng.uniform(0.5, 2.0, len(problem.obs_images))
+    return perturbed(dataclasses.replace(problem, obs_sigmas=sigmas), rng, 0.003)
 
 
 @pytest.mark.parametrize("loss", ["trivial", "cauchy"])
@@ -158,8 +160,8 @@ def test_held_entries_drop_out_of_the_step(make_problem, perturbed, rng):
     assert np.linalg.matrix_rank(H, tol=1e-9 * np.linalg.norm(H, 2)) == len(H)
 
 
-def test_squared_errors_are_those_of_the_camera(mixed):
-    slow = Slow(mixed, "trivial")
+def test_squared_errors_are_those_of_the_camera_whatever_the_sigmas(mixed):
+    slow = Slow(dataclasses.replace(mixed, obs_sigmas=None), "trivial")
     expected = np.sum(slow.residuals(np.zeros(slow.count)) ** 2, 1)
     np.testing.assert_allclose(squared_errors(mixed), expected, rtol=1e-9)
 

@@ -151,6 +151,7 @@ def test_features_read_back_as_stored_to_the_last_bit(database: Database, rng) -
         for name in ("points2D", "scales", "orientations", "descriptors"):
             np.testing.assert_array_equal(getattr(read, name), getattr(as_stored(features), name))
         np.testing.assert_array_equal(database.read_keypoints(1), read.points2D)
+        np.testing.assert_array_equal(database.read_keypoint_scales(1), read.scales)
         assert read.points2D.dtype == np.float64
 
 

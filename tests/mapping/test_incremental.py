@@ -51,6 +51,23 @@ def test_noise_and_wrong_matches_leave_poses_near_the_truth():
     assert 0.3 < model.errors.mean() < 0.8
 
 
+def test_learnt_precision_of_keypoints_makes_poses_better():
+    """Half of the keypoints are ten times as precise as the others; only their scales tell which."""
+    gains = []
+    for seed in range(3):
+        scene, rng = PointScene(points=700, seed=seed), np.random.default_rng(seed)
+        scales = {i: np.where(rng.random(len(xy)) < 0.5, 1.5, 6.0) for i, xy in scene.keypoints.items()}
+        for i, xy in scene.keypoints.items():
+            scene.keypoints[i] = xy + rng.normal(0, 1, xy.shape) * np.where(scales[i] < 2, 0.1, 1.0)[:, None]
+        errors = [
+            _pose_errors(scene, _map(scene, refine_intrinsics=False, keypoint_scales=given)[0])[1]
+            for given in (scales, None)
+        ]
+        gains.append(errors[0] / errors[1])
+    assert max(gains) < 0.6
+    assert min(gains) > 0.01
+
+
 def test_a_wrong_focal_length_is_corrected():
     scene = PointScene(images=10, noise_px=0.2, seed=2)
     guess = Camera("SIMPLE_RADIAL", 1000, 800, np.array([1100.0, 500, 400, 0]))

@@ -44,7 +44,7 @@ def plausible_geometry(points2D_1, points2D_2, matches, camera1, camera2, config
 
 def best_pair_model(
     view_graph, keypoints, cameras, image_cameras, image_names, config, *,
-    seed, threads, refine_intrinsics, observer,
+    keypoint_scales, seed, threads, refine_intrinsics, observer,
 ) -> list[Reconstruction]:  # fmt: skip
     """A model of the pair with most matches; its points lie anywhere."""
     if not view_graph.pairs:

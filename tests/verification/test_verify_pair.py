@@ -7,7 +7,6 @@ import pytest
 
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.events import PairVerified
 from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
