@@ -47,6 +47,8 @@ _MIN_SHARE_IN_VIEW = 0.3
 _MAX_VIEW_ANGLE = np.deg2rad(10.0)
 _MEAN_VIEW_ANGLE = np.deg2rad(25.0)
 _MAX_SCALE_RATIO = 1.3
+_MAX_STEP = float(np.sqrt(1 + _MAX_SCALE_RATIO**2 - 2 * _MAX_SCALE_RATIO * np.cos(_MAX_VIEW_ANGLE)))
+"""Distance of two images, in ranges of a point, up to which angle and ratio of ranges can be that small."""
 _BORDER = 0.03
 _GRID = 8
 _MIN_IN_CELL = 8
@@ -120,8 +122,17 @@ def missing_observations(model: Reconstruction) -> list[Difference]:
     """Differences between images that stand side by side in the model."""
     sees = _observers(model)
     centers = model.cams_from_world.center
-    pairs = ((a, b) for a in range(len(centers)) for b in range(len(centers)) if a != b)
-    return [found for a, b in pairs if (found := _difference(model, sees, centers, a, b)) is not None]
+    found = []
+    for a in range(len(centers)):
+        points = np.flatnonzero(sees[a] & (model.tracks.lengths >= _MIN_TRACK))
+        if len(points) < _MIN_EXPECTED:
+            continue
+        ranges = np.linalg.norm(model.points3D[points] - centers[a], axis=1)
+        reach = _MAX_STEP * np.quantile(ranges, 1 - _MIN_SHARE_IN_VIEW)
+        near = np.linalg.norm(centers - centers[a], axis=1) <= reach
+        near[a] = False
+        found += [_difference(model, sees, centers, points, a, b) for b in np.flatnonzero(near).tolist()]
+    return [difference for difference in found if difference is not None]
 
 
 def _observers(model: Reconstruction) -> np.ndarray:
@@ -131,8 +142,9 @@ def _observers(model: Reconstruction) -> np.ndarray:
     return sees
 
 
-def _difference(model: Reconstruction, sees: np.ndarray, centers: FloatArray, a: int, b: int) -> Difference | None:
-    points = np.flatnonzero(sees[a] & (model.tracks.lengths >= _MIN_TRACK))
+def _difference(
+    model: Reconstruction, sees: np.ndarray, centers: FloatArray, points: np.ndarray, a: int, b: int
+) -> Difference | None:
     camera = model.cameras[int(model.image_camera_ids[b])]
     from_a, from_b = model.points3D[points] - centers[a], model.points3D[points] - centers[b]
     range_a, range_b = np.linalg.norm(from_a, axis=1), np.linalg.norm(from_b, axis=1)
@@ -193,16 +205,24 @@ def _places(model: Reconstruction, differences: list[Difference], contradicting:
 def _should_see(model: Reconstruction, sees: np.ndarray) -> np.ndarray:
     """Which image has which point in its frame, from a direction near the mean of those that it is seen from (I, P)."""
     centers = model.cams_from_world.center
-    away = centers[:, None] - model.points3D
-    away /= np.linalg.norm(away, axis=2, keepdims=True)
-    mean = np.einsum("ip,ipk->pk", sees.astype(np.float64), away)
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    near = np.einsum("ipk,pk->ip", away, mean) > np.cos(_MEAN_VIEW_ANGLE)
+    mean = np.zeros_like(model.points3D)
     for i in range(len(sees)):
+        mean[sees[i]] += _directions(centers[i], model.points3D[sees[i]])
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    near = np.empty_like(sees)
+    for i in range(len(sees)):
+        along = np.einsum("pk,pk->p", _directions(centers[i], model.points3D), mean)
+        near[i] = along > np.cos(_MEAN_VIEW_ANGLE)
         camera = model.cameras[int(model.image_camera_ids[i])]
         xy, valid = camera.project(model.cams_from_world[i] @ model.points3D)
         near[i] &= valid & np.all((xy > 0) & (xy < [camera.width, camera.height]), axis=1)
     return near
+
+
+def _directions(center: FloatArray, points3D: FloatArray) -> FloatArray:
+    """Unit vectors (P, 3) from points towards a camera."""
+    away = center - points3D
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
 
 
 def _balanced(weight: FloatArray) -> np.ndarray:

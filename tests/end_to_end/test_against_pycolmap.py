@@ -67,5 +67,5 @@ def test_poses_are_as_good_as_those_of_pycolmap(rendered, reconstructed, theirs,
     (ours,), peer = reconstructed(name, "given"), theirs(name)
     assert len(ours.image_ids) >= len(peer.image_ids)
     mine, their = pose_errors(ours, truth), pose_errors(peer, truth)
-    assert 0 < mine.rotation_rms_deg < 1.1 * their.rotation_rms_deg + 0.003  # 0.05 px at the image's centre
+    assert 0 < mine.rotation_rms_deg < 1.1 * their.rotation_rms_deg + 0.0015  # 0.02 px at the centre of the image
     assert 0 < mine.position_rms < 1.1 * their.position_rms + 5e-5

@@ -102,7 +102,7 @@ def test_every_photo_twice_is_the_model_of_every_photo_once(few, photos, rendere
     rows = np.array([truth.image_names.index(name.removeprefix("again ")) for name in model.image_names])
     truth_poses = truth.cams_from_world[rows]
     errors = errors_of(model.cams_from_world, truth_poses, truth_poses.center)
-    assert 1e-4 < errors.rotation_deg < 0.1
+    assert 1e-4 < errors.rotation_deg < 0.05
     assert 1e-6 < errors.position < 5e-3
 
 
@@ -124,7 +124,7 @@ def test_a_flat_wall_is_reconstructed_if_the_camera_is_known(tmp_path):
     model, truth = read_model(tmp_path / "ws" / "sparse" / "0"), Rigid3.stack(poses)
     order = np.array([int(Path(name).stem) for name in model.image_names])
     errors = errors_of(model.cams_from_world, truth[order], truth.center)
-    assert 1e-4 < errors.rotation_deg < 0.1
+    assert 1e-4 < errors.rotation_deg < 0.05
     assert 1e-6 < errors.position < 5e-3
 
 

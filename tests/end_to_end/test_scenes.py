@@ -43,7 +43,7 @@ def test_two_fronts_that_look_alike_do_not_fold(rendered, reconstructed, intrins
     assert sorted(name for model in models for name in model.image_names) == sorted(truth.image_names)
     for model in models:
         errors = pose_errors(model, truth)
-        assert 1e-4 < errors.rotation_rms_deg < (0.05 if intrinsics == "given" else 0.5)
+        assert 1e-4 < errors.rotation_deg < (0.05 if intrinsics == "given" else 0.5)
         assert 1e-6 < errors.position < 5e-3
 
 
