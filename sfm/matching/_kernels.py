@@ -33,3 +33,73 @@ def scan_block(dots, first_row, squared1, squared2, best1, second1, index1, best
                 else:
                     second = distance
         best1[i], second1[i], index1[i] = best, second, index
+
+
+@njit(cache=True, nogil=True)
+def nearest_cells(dots, half_squared, cells):
+    """Fills `cells` (n, P) with the cells whose centres are nearest, the nearest first; the lower one wins a tie.
+
+    |x − c|² is smallest where x · c − ½ |c|² is largest; `dots` (n, K) are the products x · c.
+    """
+    rows, count = dots.shape
+    width = cells.shape[1]
+    largest = np.empty(width, np.float32)
+    for r in range(rows):
+        held = 0
+        for c in range(count):
+            value = dots[r, c] - half_squared[c]
+            if held == width and value <= largest[width - 1]:
+                continue
+            held = min(held + 1, width)
+            k = held - 1
+            while k > 0 and largest[k - 1] < value:
+                largest[k], cells[r, k] = largest[k - 1], cells[r, k - 1]
+                k -= 1
+            largest[k], cells[r, k] = value, c
+
+
+@njit(cache=True, nogil=True)
+def group(labels, starts, order):
+    """Sorts the positions of `labels` (n,) by label, stably: label k has `order[starts[k]:starts[k + 1]]`."""
+    starts[:] = 0
+    for label in labels:
+        starts[label + 1] += 1
+    for k in range(1, len(starts)):
+        starts[k] += starts[k - 1]
+    free = starts[:-1].copy()
+    for position in range(len(labels)):
+        label = labels[position]
+        order[free[label]] = position
+        free[label] += 1
+
+
+@njit(cache=True, nogil=True)
+def gather(source, rows, out):
+    """out[k] = source[rows[k]]."""
+    for k in range(len(rows)):
+        row = rows[k]
+        for d in range(source.shape[1]):
+            out[k, d] = source[row, d]
+
+
+@njit(cache=True, nogil=True)
+def scan_cell(dots, rows, first_column, squared1, squared2, best1, second1, index1, best2, second2, index2):
+    """As `scan_block`, for some rows of image 1 and the columns `first_column…` of image 2."""
+    for r in range(len(rows)):
+        i = rows[r]
+        offset = squared1[i]
+        best, second, index = best1[i], second1[i], index1[i]
+        for c in range(dots.shape[1]):
+            j = first_column + c
+            distance = offset + squared2[j] - np.float32(2) * dots[r, c]
+            if distance < second:
+                if distance < best:
+                    second, best, index = best, distance, np.int32(j)
+                else:
+                    second = distance
+            if distance < second2[j]:
+                if distance < best2[j]:
+                    second2[j], best2[j], index2[j] = best2[j], distance, np.int32(i)
+                else:
+                    second2[j] = distance
+        best1[i], second1[i], index1[i] = best, second, index

@@ -6,11 +6,14 @@ neither on the BLAS library nor on its threads, and ties are true ties, which th
 
 The ratio is taken of Euclidean distances. For neighbours as near as matches are it equals the ratio of angles, which
 COLMAP uses, to within a per cent.
+
+Images with many features are searched through an index (see `cells`), whose distances are exact as well.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -18,11 +21,15 @@ from jaxtyping import Bool, Float32
 from sfm.core.errors import ConfigError
 from sfm.core.scene import Features, Matches
 from sfm.matching import _kernels
+from sfm.matching.cells import Cells, SearchableFeatures
 
 _BLOCK_ROWS = 256
 """Rows of the table of distances at a time: 12 MB for 12,000 features, which stays in the cache of a core."""
 _DESCRIPTOR_NORM = 512.0
 _EXACT_BELOW = 2**24
+
+_Nearest: TypeAlias = tuple[np.ndarray, ...]
+"""Squared distance to the nearest, to the second nearest, and index of the nearest, for both directions."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,20 +47,36 @@ class MatchingConfig:
     """Each of the two features must be the other's match. Without it image 1 chooses alone, and several of its
     features may match the same one."""
 
+    exact_below: int = 3000
+    """Features an image below which all are compared with all; above, only those in cells of similar ones (see
+    `cells`), which misses one match in a hundred and takes a seventh of the time at 12,000."""
+
+    cells_searched: int = 10
+    """Cells in which the match of a feature is looked for."""
+
     def __post_init__(self) -> None:
+        if self.cells_searched < 1:
+            raise ConfigError(f"cells_searched must be at least 1, got {self.cells_searched}")
         if not 0 < self.max_ratio <= 1:
             raise ConfigError(f"max_ratio must be in (0, 1], got {self.max_ratio}")
         if self.max_distance <= 0:
             raise ConfigError(f"max_distance must be above 0, got {self.max_distance}")
 
 
-def match_features(features1: Features, features2: Features, config: MatchingConfig = MatchingConfig()) -> Matches:
+def match_features(
+    features1: Features | SearchableFeatures,
+    features2: Features | SearchableFeatures,
+    config: MatchingConfig = MatchingConfig(),
+) -> Matches:
     """Matches of two images, sorted by the index in image 1.
+
+    Where an image has many pairs, `SearchableFeatures` of it spare preparing its descriptors for each.
 
     Raises:
         ValueError: the descriptors differ in length, or are too long for exact arithmetic.
     """
-    best1, second1, index1, best2, second2, index2 = _two_nearest(features1, features2)
+    image1, image2 = _searchable(features1), _searchable(features2)
+    best1, second1, index1, best2, second2, index2 = _two_nearest(image1, image2, config)
     accepted1 = _accepted(best1, second1, config)
     if config.mutual:
         accepted2 = _accepted(best2, second2, config)
@@ -65,6 +88,10 @@ def match_features(features1: Features, features2: Features, config: MatchingCon
     return Matches(np.stack([rows, index1[rows]], axis=1).astype(np.int32))
 
 
+def _searchable(features: Features | SearchableFeatures) -> SearchableFeatures:
+    return features if isinstance(features, SearchableFeatures) else SearchableFeatures(features)
+
+
 def _accepted(
     best: Float32[np.ndarray, " N"], second: Float32[np.ndarray, " N"], config: MatchingConfig
 ) -> Bool[np.ndarray, " N"]:
@@ -73,20 +100,55 @@ def _accepted(
     return (best < config.max_ratio**2 * second.astype(np.float64)) & (best <= limit)
 
 
-def _two_nearest(features1: Features, features2: Features) -> tuple[np.ndarray, ...]:
-    """Squared distance to the nearest, to the second nearest, and index of the nearest, for both directions."""
-    if features1.descriptors.shape[1] != features2.descriptors.shape[1]:
-        lengths = features1.descriptors.shape[1], features2.descriptors.shape[1]
+def _two_nearest(image1: SearchableFeatures, image2: SearchableFeatures, config: MatchingConfig) -> _Nearest:
+    lengths = image1.descriptors.shape[1], image2.descriptors.shape[1]
+    if lengths[0] != lengths[1]:
         raise ValueError(f"descriptors must have the same length, got {lengths[0]} and {lengths[1]}")
-    if 2 * features1.descriptors.shape[1] * 255**2 >= _EXACT_BELOW:
-        raise ValueError(f"descriptors may have up to 128 dimensions, got {features1.descriptors.shape[1]}")
-    a, b = (features.descriptors.astype(np.float32) for features in (features1, features2))
+    if 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
+        raise ValueError(f"descriptors may have up to 128 dimensions, got {lengths[0]}")
+    if len(image1) * len(image2) < config.exact_below**2:
+        return _nearest_of_all(image1.descriptors, image2.descriptors)
+    return _nearest_in_cells(image1.cells, image2.cells, config.cells_searched)
+
+
+def _nearest_of_all(descriptors1: np.ndarray, descriptors2: np.ndarray) -> _Nearest:
+    a, b = (descriptors.astype(np.float32) for descriptors in (descriptors1, descriptors2))
     squared1, squared2 = (np.einsum("ij,ij->i", x, x) for x in (a, b))
-    state = (*_nothing_found(len(a)), *_nothing_found(len(b)))
+    found = (*_nothing_found(len(a)), *_nothing_found(len(b)))
     for start in range(0, len(a), _BLOCK_ROWS):
         dots = a[start : start + _BLOCK_ROWS] @ b.T
-        _kernels.scan_block(dots, start, squared1, squared2, *state)
-    return state
+        _kernels.scan_block(dots, start, squared1, squared2, *found)
+    return found
+
+
+def _nearest_in_cells(a: Cells, b: Cells, count: int) -> _Nearest:
+    """Each descriptor of `a` meets those in its nearest cells of `b`; for both directions, that is the table.
+
+    Rows are counted in the order of the cells on both sides until the end, so that neighbours in a loop are
+    neighbours in memory.
+    """
+    cells = b.nearest(a.descriptors, count)
+    starts, order = np.empty_like(b.starts), np.empty(cells.size, np.int32)
+    _kernels.group(cells.ravel(), starts, order)
+    seekers = order // cells.shape[1]
+    rows = np.empty((int(np.diff(starts).max()), a.descriptors.shape[1]), np.float32)
+    found = (*_nothing_found(len(a.order)), *_nothing_found(len(b.order)))
+    for k in range(len(b.starts) - 1):
+        mine, first, last = seekers[starts[k] : starts[k + 1]], int(b.starts[k]), int(b.starts[k + 1])
+        if len(mine) and first < last:
+            _kernels.gather(a.descriptors, mine, rows)
+            dots = rows[: len(mine)] @ b.descriptors[first:last].T
+            _kernels.scan_cell(dots, mine, first, a.squared, b.squared, *found)
+    return *_by_feature(found[:3], a.order, b.order), *_by_feature(found[3:], b.order, a.order)
+
+
+def _by_feature(found: tuple[np.ndarray, ...], order: np.ndarray, other_order: np.ndarray) -> tuple[np.ndarray, ...]:
+    """From the order of cells to that of features, for the rows and for the indices that they hold."""
+    best, second, index = found
+    by_feature = tuple(np.empty_like(column) for column in found)
+    by_feature[0][order], by_feature[1][order] = best, second
+    by_feature[2][order] = np.where(index >= 0, other_order[index], -1)
+    return by_feature
 
 
 def _nothing_found(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -25,15 +25,15 @@ from sfm.features import extract_features
 from sfm.features.sift import working_memory_bytes
 from sfm.io.database import Database, Decision
 from sfm.io.images import read_image
-from sfm.matching import exhaustive_pairs, match_features
+from sfm.matching import SearchableFeatures, exhaustive_pairs, match_features
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.keys import code_digest, key_of
 from sfm.pipeline.memory import free_memory_bytes
 from sfm.verification import verify_pair
 
 _COMMIT_EVERY_S = 1.0
-_CACHED_IMAGES = 256
-"""Features held in memory, up to 1.8 MB an image."""
+_CACHED_IMAGES = 128
+"""Images whose features are held in memory for matching, up to 8 MB each."""
 _TILE = _CACHED_IMAGES // 2
 """Pairs are visited tile by tile, so that both sides of a tile fit into the cache."""
 
@@ -111,13 +111,13 @@ def match_all(run: Run, feature_keys: Mapping[int, str]) -> dict[Pair, str]:
     pairs = exhaustive_pairs(image_id for image_id in run.images if counts.get(image_id))
     keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}
     stale = _stale(run, stage, keys, present=run.database.matched_pairs())
-    features = lru_cache(_CACHED_IMAGES)(run.database.read_features)
+    features = lru_cache(_CACHED_IMAGES)(lambda image_id: SearchableFeatures(run.database.read_features(image_id)))
 
-    def inputs() -> Iterator[tuple[Pair, Features, Features]]:
+    def inputs() -> Iterator[tuple[Pair, SearchableFeatures, SearchableFeatures]]:
         for i, j in _tiled(stale):
             yield (i, j), features(i), features(j)
 
-    def compute(item: tuple[Pair, Features, Features]) -> tuple[Pair, Matches]:
+    def compute(item: tuple[Pair, SearchableFeatures, SearchableFeatures]) -> tuple[Pair, Matches]:
         pair, features1, features2 = item
         return pair, match_features(features1, features2, config)
 

@@ -30,7 +30,7 @@ from sfm.core.scene import Features, Matches, PairKind, Reconstruction, TwoViewG
 from sfm.io.colmap_model import write_model
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
-from sfm.matching import match_features
+from sfm.matching import MatchingConfig, match_features
 from sfm.verification import verify_pair
 
 _IMAGES, _POINTS, _STRAYS = 6, 240, 24
@@ -99,7 +99,8 @@ def _pair() -> None:
     descriptors = np.random.default_rng(0).integers(0, 90, (8, 128), dtype=np.uint8)
     zeros = np.zeros(8, np.float32)
     features = Features(np.zeros((8, 2)), zeros, zeros, descriptors)
-    match_features(features, features)
+    for exact_below in (3000, 0):
+        match_features(features, features, MatchingConfig(exact_below=exact_below))
     for calibrated in (True, False):
         _verified(calibrated)
 

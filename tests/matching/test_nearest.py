@@ -67,7 +67,7 @@ def test_the_lower_index_wins_a_tie():
     features1, features2 = features_of(near), features_of(np.concatenate([far, near + 1, near - 1]))
     one_way = MatchingConfig(max_ratio=1.0, mutual=False)
     assert match_features(features1, features2, one_way).indices.tolist() == []  # as near as each other: no match
-    distances, _, index, *_ = nearest._two_nearest(features1, features2)
+    distances, _, index, *_ = nearest._nearest_of_all(features1.descriptors, features2.descriptors)
     assert index.tolist() == [1]
     assert distances.tolist() == [128.0]
 
@@ -75,7 +75,7 @@ def test_the_lower_index_wins_a_tie():
 def test_distances_are_exact_at_the_extremes():
     features1 = features_of(np.full((1, 128), 255))
     features2 = features_of(np.stack([np.zeros(128), np.r_[np.full(127, 255), 254], np.full(128, 255)]))
-    best, second, index, best2, *_ = nearest._two_nearest(features1, features2)
+    best, second, index, best2, *_ = nearest._nearest_of_all(features1.descriptors, features2.descriptors)
     assert (best[0], second[0], index[0]) == (0, 1, 2)
     assert best2.tolist() == [128 * 255**2, 1, 0]
 
@@ -100,7 +100,9 @@ def test_descriptors_of_different_or_too_great_length_are_refused():
         match_features(long, long)
 
 
-@pytest.mark.parametrize("options", [{"max_ratio": 0.0}, {"max_ratio": 1.1}, {"max_distance": 0.0}])
+@pytest.mark.parametrize(
+    "options", [{"max_ratio": 0.0}, {"max_ratio": 1.1}, {"max_distance": 0.0}, {"cells_searched": 0}]
+)
 def test_settings_out_of_range_are_refused(options):
     with pytest.raises(ConfigError, match=r"must be|above"):
         MatchingConfig(**options)
