@@ -49,7 +49,7 @@ class MappingConfig:
     init_max_forward: float = 0.95
     """Largest part of the first pair's motion along the optical axis."""
     init_trials: int = 200
-    """First pairs tried for a model."""
+    """First pairs that may fail before mapping ends."""
     resection_max_error_px: float = 12.0
     """Reprojection error of a point that agrees with a new pose; wide, as the model is not yet adjusted to it."""
     resection_min_inliers: int = 30
@@ -60,6 +60,8 @@ class MappingConfig:
     """Attempts for an image; it is tried again only when it sees more points than before."""
     min_observations: int = 10
     """Observations below which an image is taken out of the model again."""
+    min_agreeing_share: float = 0.15
+    """Share of the model's points on its tracks that an image must agree with, or it is taken out again."""
     triangulation_max_error_px: float = 8.0
     """Reprojection error for a view to join a new point, before adjustment."""
     max_error_px: float = 4.0
@@ -152,21 +154,25 @@ class _Mapper:
         """Models of all images that hang together, the one with most images first."""
         states: list[State] = []
         used = np.zeros(len(self.scene.image_ids), bool)
-        while len(states) < self.config.max_models and (state := self.grow_model(used)) is not None:
-            used |= state.registered
-            states.append(state)
+        failed: set[tuple[int, int]] = set()
+        while len(states) < self.config.max_models and (start := self.start_from_best_pair(used, failed)) is not None:
+            state, pair = start
+            self.grow_model(state, used)
+            if state.registered.sum() >= 2:
+                used |= state.registered
+                states.append(state)
+            else:  # grown from a wrong pair, nothing in it agreed in the end
+                failed.add((pair.image1, pair.image2))
         states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
         kept = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
         return [state.to_reconstruction() for state in kept]
 
-    def grow_model(self, used: np.ndarray) -> State | None:
-        """One model among the images that are not `used`; None where no pair starts one."""
-        state = self.start_from_best_pair(used)
-        if state is None:
-            return None
+    def grow_model(self, state: State, used: np.ndarray) -> None:
+        """Adds all images that fit and are not `used` to a model of two; what does not hold may fall apart again."""
         images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
         tried_at: dict[int, list[int]] = {}
-        while (registered := self.register_next(state, used, tried_at)) is not None:
+        registered = self.register_next(state, used, tried_at)
+        while registered is not None:
             images, points = int(state.registered.sum()), int(state.has_point.sum())
             growth = self.config.global_growth
             if images >= growth * images_then or points >= growth * points_then:
@@ -174,11 +180,16 @@ class _Mapper:
                 images_then, points_then = images, int(state.has_point.sum())
             else:
                 self.adjust_around(state, registered)
+            registered = self.register_next(state, used, tried_at)
+            if registered is None and self.drop_misplaced_images(state):
+                registered = self.register_next(state, used, tried_at)
         self.refine(state, rounds=5, final=True)
-        return state
 
-    def start_from_best_pair(self, used: np.ndarray) -> State | None:
-        """A model of two images."""
+    def start_from_best_pair(self, used: np.ndarray, failed: set[tuple[int, int]]) -> tuple[State, InitialPair] | None:
+        """A model of two images that are not `used`, by a pair that has not `failed`; None where no pair starts one.
+
+        Pairs that do not start a model are added to `failed`; `init_trials` may be there.
+        """
         config = self.config
         blank = State.start(self.scene)
         blank.registered |= used
@@ -186,10 +197,16 @@ class _Mapper:
         acceptable = acceptable_pairs(
             candidates, config.init_min_inliers, np.deg2rad(config.init_min_angle_deg), config.init_max_forward
         )
-        for _, pair in zip(range(config.init_trials), acceptable, strict=False):
+        for pair in acceptable:
+            if len(failed) >= config.init_trials:
+                break
+            rows = (pair.image1, pair.image2)
+            if rows in failed:
+                continue
             state = self.start_from(pair)
             if state is not None:
-                return state
+                return state, pair
+            failed.add(rows)
         return None
 
     def start_from(self, pair: InitialPair) -> State | None:
@@ -273,6 +290,7 @@ class _Mapper:
             self.triangulate_seen_by(state, np.flatnonzero(state.registered))
             state.filter(all_tracks, config.max_error_px, min_angle)
             self.drop_lost_images(state)
+            self.drop_misplaced_images(state)
             if np.sum(state.on != before) <= 0.0005 * np.sum(before):
                 break
         if final:
@@ -288,6 +306,24 @@ class _Mapper:
         for image in np.flatnonzero(state.registered & (views < self.config.min_observations)).tolist():
             state.unregister(image)
             self.tell(state, image, Rejected("lost_observations", f"{views[image]} of its observations still fit"))
+
+    def drop_misplaced_images(self, state: State) -> bool:
+        """Takes out images that disagree with most points of the model that they should see; True if there are any.
+
+        A wrong pose can hold itself up by the few false matches that it comes from, e.g. that of the first pair.
+        """
+        on, observed = np.zeros(len(state.registered)), np.zeros(len(state.registered))
+        np.add.at(on, self.scene.image[state.on], 1)
+        np.add.at(observed, self.scene.image[state.has_point[self.scene.track_of]], 1)
+        share = on / np.maximum(observed, 1)
+        misplaced = np.flatnonzero(state.registered & (share < self.config.min_agreeing_share))
+        if state.registered.sum() - len(misplaced) < 2:
+            return False
+        for image in misplaced.tolist():
+            state.unregister(image)
+            detail = f"agrees with {100 * share[image]:.0f} % of the points that it should see"
+            self.tell(state, image, Rejected("misplaced", detail))
+        return len(misplaced) > 0
 
     def adjust_all(
         self, state: State, bundle: BundleConfig, *, principal_points: bool = False, weighted: bool = False

@@ -31,6 +31,8 @@ class InitialPair:
 
 _GOOD_ANGLE = np.deg2rad(16.0)
 _GUESSED_PLANE_TRUST = 0.01
+_RELAXED = ((1, 1), (2, 1), (4, 1), (2, 2), (4, 2), (8, 1), (4, 4), (8, 4), (16, 4))
+"""By what the least angle and the least number of matches of a first pair are divided, one after the other."""
 
 
 def rank_initial_pairs(state: State, view_graph: ViewGraph) -> list[InitialPair]:
@@ -81,16 +83,16 @@ def _measure(state: State, image1: int, image2: int, matches: np.ndarray, cam2_f
 def acceptable_pairs(
     candidates: list[InitialPair], min_inliers: int, min_angle: float, max_forward: float
 ) -> Iterator[InitialPair]:
-    """Candidates that meet the thresholds, then those that meet them halved, and so on; each only once.
+    """Candidates that meet the thresholds, then those that meet parts of them, see `_RELAXED`; each only once.
 
-    The number of matches is halved twice at most, the angle down to a sixteenth: on a drive along a street all pairs
-    are narrow, and many matches make up for it. Forward motion, a poor start, is there the only one.
+    On a drive along a street all true pairs are narrow, and many matches make up for it, while the few wide ones may be
+    chance. Forward motion, a poor start, is there the only one.
     """
     given = set()
-    for relax in (1, 2, 4, 8, 16):
+    for of_angle, of_inliers in _RELAXED:
         for index, pair in enumerate(candidates):
-            meets = pair.inliers * min(relax, 4) >= min_inliers and pair.angle * relax >= min_angle
-            meets = meets and (pair.forward <= max_forward or relax > 1)
+            meets = pair.inliers * of_inliers >= min_inliers and pair.angle * of_angle >= min_angle
+            meets = meets and (pair.forward <= max_forward or of_angle > 1)
             if meets and index not in given:
                 given.add(index)
                 yield pair

@@ -32,6 +32,7 @@ class PointScene:
             assert valid.all()
             order[i] = rng.permutation(points)
             self.keypoints[i] = (xy + rng.normal(0, noise_px, xy.shape))[order[i]]
+        self.order = order
         pairs = {}
         for i in self.keypoints:
             for j in range(i + 1, images + 1):

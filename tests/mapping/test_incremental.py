@@ -6,11 +6,13 @@ import pytest
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError
 from sfm.core.events import ImageRegistered
+from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.similarity import Sim3, estimate_similarity
-from sfm.core.scene import PairKind, ViewGraph
+from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
 from sfm.mapping import MappingConfig, build_tracks, map_incrementally
+from sfm.mapping.incremental import _Mapper
 from sfm.mapping.state import Scene, State
-from tests.mapping.scenes import PointScene
+from tests.mapping.scenes import PointScene, look_at
 
 
 def _map(scene, **options):
@@ -49,6 +51,61 @@ def test_noise_and_wrong_matches_leave_poses_near_the_truth():
     assert 1e-4 < rotation_deg < 0.1
     assert position < 0.01
     assert 0.3 < model.errors.mean() < 0.8
+
+
+def _with_false_wide_pair(scene, first=1, last=8, count=60):
+    """The only wide pair is a false one: as if `first` saw some points from a place where it never was."""
+    elsewhere = look_at(np.array([4.0, 0.5, -3.0]), np.zeros(3))
+    real = scene.view_graph.pairs[first, last].matches[:, 1][:count]
+    points = scene.points[scene.order[last][real]]
+    xy, valid = scene.camera.project(elsewhere @ points)
+    assert valid.all()
+    matches = np.stack([len(scene.keypoints[first]) + np.arange(count), real], 1).astype(np.int32)
+    scene.keypoints[first] = np.concatenate([scene.keypoints[first], xy])
+    motion = scene.poses[last - 1] @ elsewhere.inverse()
+    unit = Rigid3(motion.rotation, motion.translation / np.linalg.norm(motion.translation))
+    pairs = dict(scene.view_graph.pairs)
+    pairs[first, last] = TwoViewGeometry(PairKind.CALIBRATED, matches, unit)
+    scene.view_graph = ViewGraph(pairs)
+    return scene
+
+
+def test_a_first_pair_that_leads_nowhere_gives_way_to_the_next():
+    scene = _with_false_wide_pair(PointScene(noise_px=0.3, spread_deg=14.0))
+    events = []
+    (model,) = _map(scene, config=MappingConfig(init_min_inliers=50), refine_intrinsics=False, observer=events.append)
+    first = [event.name for event in events if isinstance(event, ImageRegistered)][:2]
+    assert first == ["001.jpg", "008.jpg"]
+    assert len(model.image_names) == 8
+    assert _pose_errors(scene, model)[1] < 0.05
+
+
+def test_an_image_that_disagrees_with_what_it_should_see_is_misplaced():
+    scene, events = PointScene(noise_px=0.3), []
+    tracks = build_tracks(scene.view_graph, scene.keypoints, min_length=2)
+    rows = Scene.build(tracks, scene.keypoints, scene.cameras, scene.image_cameras, scene.image_names)
+    mapper = _Mapper(rows, scene.view_graph, MappingConfig(), 0, 1, False, events.append)
+    state = State.start(rows)
+    for row, pose in enumerate(scene.poses):
+        state.set_pose(row, pose)
+    mapper.triangulate_seen_by(state, np.arange(8))
+    assert not mapper.drop_misplaced_images(state)
+    # What image 3 sees no longer fits, but for one in ten: its own points, as a false pair would have made them.
+    mine = rows.observations_of(2)
+    state.on[mine[40:]] = False
+    assert mapper.drop_misplaced_images(state)
+    assert not state.registered[2]
+    assert not state.on[mine].any()
+    assert state.registered.sum() == 7
+    assert [(event.name, event.reason.split(":")[0]) for event in events] == [("003.jpg", "misplaced")]
+
+
+def test_many_narrow_matches_start_better_than_few_wide_ones():
+    scene = _with_false_wide_pair(PointScene(noise_px=0.3, spread_deg=30.0))
+    events = []
+    _map(scene, refine_intrinsics=False, observer=events.append)
+    first = [event.name for event in events if isinstance(event, ImageRegistered)][:2]
+    assert first != ["001.jpg", "008.jpg"]
 
 
 def test_learnt_precision_of_keypoints_makes_poses_better():
