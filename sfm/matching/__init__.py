@@ -2,6 +2,5 @@
 
 from sfm.matching.cells import SearchableFeatures
 from sfm.matching.nearest import MatchingConfig, match_features
-from sfm.matching.pairs import exhaustive_pairs
 
-__all__ = ["MatchingConfig", "SearchableFeatures", "exhaustive_pairs", "match_features"]
+__all__ = ["MatchingConfig", "SearchableFeatures", "match_features"]

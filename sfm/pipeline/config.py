@@ -20,6 +20,7 @@ from sfm.core.errors import ConfigError
 from sfm.features import FeatureConfig
 from sfm.mapping import MappingConfig
 from sfm.matching import MatchingConfig
+from sfm.retrieval import RetrievalConfig
 from sfm.verification import VerificationConfig
 
 
@@ -55,6 +56,7 @@ class PipelineConfig:
 
     cameras: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     features: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
+    retrieval: RetrievalConfig = dataclasses.field(default_factory=RetrievalConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
     verification: VerificationConfig = dataclasses.field(default_factory=VerificationConfig)
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)

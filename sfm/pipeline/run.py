@@ -23,9 +23,10 @@ from sfm.pipeline.manifest import write_manifest
 from sfm.pipeline.memory import peak_memory_bytes
 from sfm.pipeline.models import map_all
 from sfm.pipeline.observers import LogFiles, watched
+from sfm.pipeline.pairs import match_and_verify
 from sfm.pipeline.report import RunReport, figures_of, no_model_error
 from sfm.pipeline.scene import Scene, read_scene
-from sfm.pipeline.stages import Run, extract_all, match_all, verify_all
+from sfm.pipeline.stages import Run, extract_all
 from sfm.pipeline.warm_up import compile_kernels
 
 
@@ -64,8 +65,7 @@ def reconstruct(
         run = Run(database, config, threads, tell, scene.images)
         compile_kernels(tell, threads=threads)
         feature_keys = extract_all(run)
-        match_keys = match_all(run, feature_keys)
-        pair_keys = verify_all(run, match_keys)
+        match_keys, pair_keys = match_and_verify(run, feature_keys)
         models, model_key = map_all(run, pair_keys, workspace / "sparse")
 
         if not models:
@@ -125,7 +125,7 @@ def _no_model(run: Run) -> SfmError:
 
 
 class _Stopwatch:
-    """Wall time of each stage, as its events tell."""
+    """Wall time of each stage, all its rounds, as its events tell."""
 
     def __init__(self) -> None:
         self.times_s: dict[str, float] = {}
@@ -136,7 +136,7 @@ class _Stopwatch:
             case StageStarted():
                 self._started = time.perf_counter()
             case StageFinished(stage=stage):
-                self.times_s[stage] = time.perf_counter() - self._started
+                self.times_s[stage] = self.times_s.get(stage, 0.0) + time.perf_counter() - self._started
 
     def close(self) -> None:
         """Nothing is open."""

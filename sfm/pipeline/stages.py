@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
@@ -25,7 +25,7 @@ from sfm.features import extract_features
 from sfm.features.sift import working_memory_bytes
 from sfm.io.database import Database, Decision
 from sfm.io.images import read_image
-from sfm.matching import SearchableFeatures, exhaustive_pairs, match_features
+from sfm.matching import SearchableFeatures, match_features
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.keys import code_digest, key_of
 from sfm.pipeline.memory import free_memory_bytes
@@ -103,12 +103,10 @@ def extract_all(run: Run) -> dict[int, str]:
     return keys
 
 
-def match_all(run: Run, feature_keys: Mapping[int, str]) -> dict[Pair, str]:
-    """Putative matches of all pairs of images that have features; returns the key of each pair."""
+def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) -> dict[Pair, str]:
+    """Putative matches of pairs i < j of images that have features; returns the key of each pair."""
     stage, config = "matching", run.config.matching
     basis = key_of(code_digest("sfm.matching", "sfm.core"), config)
-    counts = run.database.feature_counts()
-    pairs = exhaustive_pairs(image_id for image_id in run.images if counts.get(image_id))
     keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}
     stale = _stale(run, stage, keys, present=run.database.matched_pairs())
     features = lru_cache(_CACHED_IMAGES)(lambda image_id: SearchableFeatures(run.database.read_features(image_id)))
@@ -130,7 +128,6 @@ def match_all(run: Run, feature_keys: Mapping[int, str]) -> dict[Pair, str]:
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
     _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
-    _forget_other_pairs(run, stage, keys)
     median = np.median(list(run.database.match_counts().values())) if keys else 0
     run.observer(StageFinished(stage=stage, summary=f"{len(keys)} pairs, {median:.0f} matches in the median"))
     return keys
@@ -171,7 +168,6 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
     _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
-    _forget_other_pairs(run, stage, keys)
     rejected = len(run.database.rejected_pairs())
     run.observer(StageFinished(stage=stage, summary=f"{len(keys) - rejected} of {len(keys)} pairs"))
     return keys
@@ -227,13 +223,15 @@ def _tiled(pairs: Iterable[Pair]) -> list[Pair]:
     return sorted(pairs, key=lambda pair: (pair[0] // _TILE, pair[1] // _TILE, pair))
 
 
-def _forget_other_pairs(run: Run, stage: str, keys: Mapping[Pair, str]) -> None:
-    """Drops results of pairs that are no longer wanted."""
-    wanted = {_label(pair) for pair in keys}
-    clear = run.database.clear_matches if stage == "matching" else run.database.clear_geometries
-    present = run.database.matched_pairs() if stage == "matching" else run.database.verified_pairs()
-    with run.database.transaction():
-        run.database.clear_stage(stage, [label for label in run.database.stage_keys(stage) if label not in wanted])
-        for pair in present:
-            if pair not in keys:
-                clear(pair)
+def forget_other_pairs(run: Run, pairs: Collection[Pair]) -> None:
+    """Drops matches and geometries of pairs that are no longer wanted, and keys of pairs that went with their image."""
+    database, wanted = run.database, {_label(pair) for pair in pairs}
+    with database.transaction():
+        for stage, present, clear in (
+            ("matching", database.matched_pairs(), database.clear_matches),
+            ("verification", database.verified_pairs(), database.clear_geometries),
+        ):
+            database.clear_stage(stage, [label for label in database.stage_keys(stage) if label not in wanted])
+            for pair in present:
+                if pair not in pairs:
+                    clear(pair)

@@ -5,7 +5,7 @@ import pytest
 
 from sfm.core.errors import ConfigError
 from sfm.core.scene import Features
-from sfm.matching import MatchingConfig, exhaustive_pairs, match_features, nearest
+from sfm.matching import MatchingConfig, match_features, nearest
 
 
 def features_of(descriptors: np.ndarray) -> Features:
@@ -106,8 +106,3 @@ def test_descriptors_of_different_or_too_great_length_are_refused():
 def test_settings_out_of_range_are_refused(options):
     with pytest.raises(ConfigError, match=r"must be|above"):
         MatchingConfig(**options)
-
-
-def test_exhaustive_pairs_are_sorted_and_each_occurs_once():
-    assert exhaustive_pairs([5, 1, 3, 1]) == [(1, 3), (1, 5), (3, 5)]
-    assert exhaustive_pairs([4]) == []

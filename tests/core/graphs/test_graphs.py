@@ -7,7 +7,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as scipy_components
 from scipy.sparse.csgraph import minimum_spanning_tree as scipy_tree
 
-from sfm.core.graphs import _kernels, connected_components, connected_labels, maximum_spanning_tree
+from sfm.core.graphs import (
+    _kernels,
+    connected_components,
+    connected_labels,
+    maximum_spanning_tree,
+    two_edge_connected_labels,
+)
 
 COUNT = 12
 EDGES = st.integers(0, 25).flatmap(lambda m: hnp.arrays(np.int64, (m, 2), elements=st.integers(0, COUNT - 1)))
@@ -136,3 +142,30 @@ def test_infinite_weights_are_allowed_and_nan_is_not():
 def test_a_missing_weight_is_refused():
     with pytest.raises((ValueError, TypeError)):
         maximum_spanning_tree(3, np.array([[0, 1], [1, 2]]), np.ones(1))
+
+
+def _labels_by_definition(count, edges):
+    """Two nodes share a part if no single edge, taken away, separates them."""
+    simple = sorted({(min(e), max(e)) for e in edges})
+    together = np.ones((count, count), bool)
+    for gone in [None, *simple]:
+        rest = np.array([e for e in simple if e != gone], np.int64).reshape(-1, 2)
+        labels = connected_labels(count, rest)
+        together &= labels[:, None] == labels
+    return together.argmax(axis=1)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_parts_of_the_two_edge_connected_labels_are_those_that_no_edge_separates(seed):
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 14))
+    edges = rng.integers(0, count, (int(rng.integers(0, 2 * count)), 2))
+    expected = _labels_by_definition(count, [tuple(e) for e in edges.tolist()])
+    np.testing.assert_array_equal(two_edge_connected_labels(count, edges), expected)
+    np.testing.assert_array_equal(two_edge_connected_labels(count, rng.permuted(edges, axis=1)[::-1]), expected)
+
+
+def test_a_bridge_separates_two_rings():
+    rings = [(0, 1), (1, 2), (2, 0), (3, 4), (4, 5), (5, 3), (2, 3)]
+    assert two_edge_connected_labels(6, np.array(rings)).tolist() == [0, 0, 0, 3, 3, 3]
+    assert two_edge_connected_labels(6, np.array([*rings, (0, 5)])).tolist() == [0] * 6
