@@ -43,8 +43,8 @@ class RetrievalConfig:
     probe_ratio: float = 0.85
     """Largest ratio of the distances to the nearest and the second nearest for a match between probes."""
     min_score: int = 6
-    """Matches of probes that make a pair promising. Nine in ten pairs of different places have no more by chance; of 2,203
-    pairs with 30 verified matches in 14 sets, this and `partners` keep 97 %."""
+    """Matches of probes that make a pair promising. Nine in ten pairs of different places have no more by chance; of
+    2,203 pairs with 30 verified matches in 14 sets, this and `partners` keep 97 %."""
     partners: int = 12
     """Partners of each image with most matches of probes that are promising in any case, if they have at least two."""
     neighbors: int = 2
