@@ -23,7 +23,7 @@ def adjust(
     problem: BundleProblem, config: BundleConfig = BundleConfig(), *, threads: int = 1, observer: Observer = SILENT,
     scope: str = "global",
 ) -> BundleResult:  # fmt: skip
-    """Minimises ½ Σ ρ(|projected − observed|²) over the free poses, points and camera parameters.
+    """Minimises ½ Σ ρ(|projected − observed|² / σ²) over the free poses, points and camera parameters.
 
     Observations without a projection at the start take no part. A point is never moved to where it loses a
     projection that it would keep where it is; an observation that loses its own all the same, because its camera
@@ -39,7 +39,8 @@ def adjust(
     held = np.zeros((len(layout.slot_image), 6), bool)
     if config.gauge == "two_cameras":
         held = held_by_two_cameras(problem, layout)
-    worst = max(_LOST_PX**2, float(squared[active].max(initial=0.0)))
+    weighted = squared[active] if problem.obs_sigmas is None else squared[active] / problem.obs_sigmas[active] ** 2
+    worst = max(_LOST_PX**2, float(weighted.max(initial=0.0)))
     lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
     system = BundleSystem(problem, layout, held, config, lost_cost, threads)
     result = _result(problem, system, _minimize(system, config), active)

@@ -26,7 +26,7 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera, model_by_id
 from sfm.core.errors import FormatError, Rejected
-from sfm.core.scene import Features, Matches, TwoViewGeometry, ViewGraph
+from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry, ViewGraph
 from sfm.io import _database_rows as rows_
 from sfm.io.bookkeeping import Bookkeeping, Decision, ImageSource
 from sfm.io.database_schema import open_readonly, open_writable
@@ -337,6 +337,14 @@ class Database(Bookkeeping):
     def verified_pairs(self) -> tuple[tuple[int, int], ...]:
         """All pairs that verification has seen, rejected ones included, sorted."""
         return tuple(pair_of(k) for (k,) in self._fetch("SELECT pair_id FROM two_view_geometries ORDER BY pair_id"))
+
+    def linked_pairs(self) -> tuple[tuple[int, int], ...]:
+        """The pairs that verification found to show one place: neither rejected nor held by watermarks only; sorted."""
+        unlinked = (rows_.UNDEFINED_KIND, int(PairKind.WATERMARK))
+        rows = self._fetch(
+            "SELECT pair_id FROM two_view_geometries WHERE rows > 0 AND config NOT IN (?, ?) ORDER BY pair_id", unlinked
+        )
+        return tuple(pair_of(k) for (k,) in rows)
 
     def rejected_pairs(self) -> dict[tuple[int, int], Rejected]:
         """The pairs that verification rejected, and why."""

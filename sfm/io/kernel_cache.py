@@ -60,12 +60,12 @@ def user_cache_folder() -> Path:
 
 
 def is_complete(folder: Path) -> bool:
-    """Whether a whole run has already compiled all that it needed into `folder`."""
+    """Whether all kernels of a run are compiled into `folder`."""
     return (folder / f"{_COMPLETE}-{kernel_hash()}").exists()
 
 
 def mark_complete(folder: Path) -> None:
-    """Notes that a whole run has succeeded with the kernels in `folder`."""
+    """Notes that all kernels of a run are in `folder`."""
     if _is_writable(folder):
         (folder / f"{_COMPLETE}-{kernel_hash()}").touch()
 

@@ -128,7 +128,7 @@ def missing_observations(model: Reconstruction) -> list[Difference]:
         if len(points) < _MIN_EXPECTED:
             continue
         ranges = np.linalg.norm(model.points3D[points] - centers[a], axis=1)
-        reach = _MAX_STEP * np.quantile(ranges, 1 - _MIN_SHARE_IN_VIEW)
+        reach = _MAX_STEP * np.quantile(ranges, 1 - _MIN_SHARE_IN_VIEW, method="higher")
         near = np.linalg.norm(centers - centers[a], axis=1) <= reach
         near[a] = False
         found += [_difference(model, sees, centers, points, a, b) for b in np.flatnonzero(near).tolist()]

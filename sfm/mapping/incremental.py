@@ -45,7 +45,7 @@ class MappingConfig:
     init_min_inliers: int = 100
     """Matches of the first pair; halved and quartered where no pair has them."""
     init_min_angle_deg: float = 16.0
-    """Median angle between the rays of the first pair; relaxed with the matches."""
+    """Median angle between the rays of the first pair; relaxed before the matches are."""
     init_max_forward: float = 0.95
     """Largest part of the first pair's motion along the optical axis."""
     init_trials: int = 200

@@ -10,8 +10,9 @@ where 1.1774 σ is the median of a Rayleigh distribution, and a point of v views
 its own coordinates. Adjustment then divides each residual by the σ of its group, up to a common factor.
 
 Weights make the estimate less of the few coarse keypoints and more of the many fine ones: on templeRing the median
-position error falls from 0.80 to 0.45 mm, and with known cameras none of four sets of real photos loses more than 0.1 points of
-AUC at 1°. Fixed laws such as σ ∝ s do harm there, as the finest keypoints of a small image are no better than the next.
+position error falls from 0.80 to 0.45 mm, and with known cameras none of four sets of real photos loses more than 0.1
+points of AUC at 1°. Fixed laws such as σ ∝ s do harm there, as the finest keypoints of a small image are no better than
+the next.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
@@ -57,14 +56,22 @@ class SearchableFeatures:
 
     def __init__(self, features: Features) -> None:
         self.descriptors = features.descriptors
+        self._cells: Cells | None = None
 
     def __len__(self) -> int:
         return len(self.descriptors)
 
-    @functools.cached_property
+    @property
     def cells(self) -> Cells:
-        """Two threads that ask for it first at once both compute it, to the same end."""
-        return sort_into_cells(self.descriptors.astype(np.float32))
+        """Two threads that ask for it first at once both compute it, to the same end; others are not held up."""
+        if self._cells is None:
+            self._cells = sort_into_cells(self.descriptors.astype(np.float32))
+        return self._cells
+
+    @property
+    def has_cells(self) -> bool:
+        """Whether the cells were needed so far."""
+        return self._cells is not None
 
 
 def sort_into_cells(descriptors: Float32[np.ndarray, "N D"]) -> Cells:

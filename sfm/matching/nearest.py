@@ -55,6 +55,8 @@ class MatchingConfig:
     """Cells in which the match of a feature is looked for."""
 
     def __post_init__(self) -> None:
+        if self.exact_below < 0:
+            raise ConfigError(f"exact_below must not be negative, got {self.exact_below}")
         if self.cells_searched < 1:
             raise ConfigError(f"cells_searched must be at least 1, got {self.cells_searched}")
         if not 0 < self.max_ratio <= 1:
@@ -106,7 +108,7 @@ def _two_nearest(image1: SearchableFeatures, image2: SearchableFeatures, config:
         raise ValueError(f"descriptors must have the same length, got {lengths[0]} and {lengths[1]}")
     if 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
         raise ValueError(f"descriptors may have up to 128 dimensions, got {lengths[0]}")
-    if len(image1) * len(image2) < config.exact_below**2:
+    if len(image1) * len(image2) < max(1, config.exact_below**2):
         return _nearest_of_all(image1.descriptors, image2.descriptors)
     return _nearest_in_cells(image1.cells, image2.cells, config.cells_searched)
 

@@ -30,6 +30,7 @@ def match_and_verify(run: Run, feature_keys: Mapping[int, str]) -> tuple[dict[Pa
     if len(usable) <= config.exhaustive_up_to:
         match_keys = match_all(run, feature_keys, exhaustive_pairs(usable))
         pair_keys = verify_all(run, match_keys)
+        run.database.clear_ledger(STAGE)
     else:
         match_keys, pair_keys = _in_rounds(run, feature_keys, usable)
     forget_other_pairs(run, match_keys)
@@ -48,12 +49,11 @@ def _in_rounds(
 
     scores = _scores(run, feature_keys, ids)
     pairs = named(promising_pairs(scores, config))
-    _note_partners(run, ids, pairs)
-    linked: set[Pair] = set()
+    linked: set[Pair] | None = None
     while True:
         match_keys = match_all(run, feature_keys, sorted(pairs))
         pair_keys = verify_all(run, match_keys)
-        before, linked = linked, (set(run.database.verified_pairs()) - set(run.database.rejected_pairs())) & pairs
+        before, linked = linked, pairs.intersection(run.database.linked_pairs())
         if linked == before:
             break
         tried, joined = ([(row[i], row[j]) for i, j in some] for some in (pairs, linked))
@@ -61,6 +61,7 @@ def _in_rounds(
         if not links:
             break
         pairs |= links
+    _note_partners(run, ids, pairs)
     return match_keys, pair_keys
 
 

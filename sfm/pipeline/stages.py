@@ -128,7 +128,8 @@ def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) 
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
     _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
-    median = np.median(list(run.database.match_counts().values())) if keys else 0
+    counts = run.database.match_counts()
+    median = np.median([counts[pair] for pair in keys]) if keys else 0
     run.observer(StageFinished(stage=stage, summary=f"{len(keys)} pairs, {median:.0f} matches in the median"))
     return keys
 
@@ -168,7 +169,7 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
     _keep_as_they_come(run.database, ordered_map(compute, inputs(), threads=run.threads), write)
-    rejected = len(run.database.rejected_pairs())
+    rejected = len(keys.keys() & run.database.rejected_pairs().keys())
     run.observer(StageFinished(stage=stage, summary=f"{len(keys) - rejected} of {len(keys)} pairs"))
     return keys
 

@@ -52,7 +52,10 @@ def compile_kernels(observer: Observer, *, threads: int) -> None:
     observer(Note(message="compiling kernels (first run only), about 20 seconds on two cores"))
     began = time.perf_counter()
     parts = list(_PARTS)
-    failures = _in_processes([parts] if threads == 1 else [[part] for part in parts])
+    try:
+        failures = _in_processes([parts] if threads == 1 else [[part] for part in parts])
+    except OSError as error:  # no memory for a process, or none may be started
+        failures = [str(error)]
     if failures:
         message = f"compiling ahead failed, so the stages will take longer: {'; '.join(failures)}"
         observer(Note(message=message, level="warning"))
@@ -64,7 +67,8 @@ def compile_kernels(observer: Observer, *, threads: int) -> None:
 def _in_processes(shares: Sequence[Sequence[str]]) -> list[str]:
     """Runs each share of the parts in a process of its own, all at once; the last words of those that fail.
 
-    The processes import what this one would, and none outlives the call.
+    The processes import what this one would. None outlives the call; if this process is killed, they end by
+    themselves when their parts are compiled.
     """
     path = os.pathsep.join(entry or os.getcwd() for entry in sys.path)
     environment = {**os.environ, "PYTHONPATH": path}

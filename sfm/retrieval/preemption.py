@@ -27,7 +27,7 @@ from sfm.core.scene import Features
 from sfm.retrieval import _kernels
 
 _IMAGES_AT_ONCE = 32
-"""Images whose probes meet those of one in one product: 8 MB of distances."""
+"""Images whose probes meet those of one in one product: 11 MB of distances."""
 
 Pair = tuple[int, int]
 

@@ -155,6 +155,14 @@ def test_features_read_back_as_stored_to_the_last_bit(database: Database, rng) -
         assert read.points2D.dtype == np.float64
 
 
+def test_pairs_that_only_a_watermark_holds_are_not_linked(database: Database) -> None:
+    matches = np.zeros((20, 2), np.int32)
+    database.write_geometry(1, 2, TwoViewGeometry(PairKind.PLANAR, matches))
+    database.write_geometry(1, 3, TwoViewGeometry(PairKind.WATERMARK, matches))
+    database.write_geometry(2, 3, Rejected("too_few_matches", "3 of 15"))
+    assert database.linked_pairs() == ((1, 2),)
+
+
 def test_an_image_without_features_is_not_one_without_extraction(database: Database, rng) -> None:
     database.write_features(2, random_features(0, rng))
     assert database.feature_counts() == {2: 0}

@@ -46,10 +46,10 @@ def test_the_index_is_used_above_the_limit_and_gives_the_same_when_it_is_prepare
     prepared1, prepared2 = SearchableFeatures(features1), SearchableFeatures(features2)
     expected = match_features(features1, features2, EVERYWHERE).indices
     np.testing.assert_array_equal(match_features(prepared1, prepared2, EVERYWHERE).indices, expected)
-    assert "cells" in vars(prepared1)
+    assert prepared1.has_cells
     few = SearchableFeatures(features1)
     match_features(few, prepared2, MatchingConfig(exact_below=301))
-    assert "cells" not in vars(few)
+    assert not few.has_cells
 
 
 @pytest.mark.parametrize("count", [1, 2, 47, 96, 1000])

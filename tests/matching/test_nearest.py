@@ -89,7 +89,8 @@ def test_a_feature_too_far_from_all_others_has_no_match():
 @pytest.mark.parametrize(("count1", "count2"), [(0, 0), (0, 5), (5, 0)])
 def test_no_features_give_no_matches(count1, count2):
     features1, features2 = features_of(np.zeros((count1, 128))), features_of(np.zeros((count2, 128)))
-    assert match_features(features1, features2).indices.shape == (0, 2)
+    for config in (MatchingConfig(), MatchingConfig(exact_below=0)):
+        assert match_features(features1, features2, config).indices.shape == (0, 2)
 
 
 def test_descriptors_of_different_or_too_great_length_are_refused():
@@ -101,8 +102,9 @@ def test_descriptors_of_different_or_too_great_length_are_refused():
 
 
 @pytest.mark.parametrize(
-    "options", [{"max_ratio": 0.0}, {"max_ratio": 1.1}, {"max_distance": 0.0}, {"cells_searched": 0}]
+    "options",
+    [{"max_ratio": 0.0}, {"max_ratio": 1.1}, {"max_distance": 0.0}, {"cells_searched": 0}, {"exact_below": -1}],
 )
 def test_settings_out_of_range_are_refused(options):
-    with pytest.raises(ConfigError, match=r"must be|above"):
+    with pytest.raises(ConfigError, match=r"must|above"):
         MatchingConfig(**options)

@@ -59,6 +59,25 @@ def test_what_the_first_look_misses_is_tried_while_it_helps(tmp_path):
         assert min(links) >= 2
 
 
+def test_a_first_look_that_finds_nothing_is_not_the_end(tmp_path):
+    blind = RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=0, min_score=10**6)
+    run(two_walks(tmp_path / "photos"), tmp_path / "ws", PipelineConfig(retrieval=blind))
+    _, verified = _pairs(tmp_path / "ws")
+    assert {(f"{walk}{k}.png", f"{walk}{k + 1}.png") for walk in "ab" for k in range(4)} <= verified
+
+
+def test_fewer_photos_leave_no_stale_ledger_and_a_true_summary(tmp_path):
+    photos = two_walks(tmp_path / "photos")
+    run(photos, tmp_path / "ws", PipelineConfig(retrieval=RetrievalConfig(exhaustive_up_to=10)))
+    told = run(photos, tmp_path / "ws", PipelineConfig(retrieval=FEW))
+    said = [e.summary for e in told.events if isinstance(e, StageFinished) and e.stage == "verification"]
+    kept, of = (int(word) for word in said[-1].split()[0:3:2])
+    assert 0 < kept <= of < 45
+    run(photos, tmp_path / "ws", PipelineConfig(retrieval=RetrievalConfig(exhaustive_up_to=10)))
+    with Database.open(tmp_path / "ws" / "database.db") as database:
+        assert not [row for row in database.ledger() if row.stage == "pairs"]
+
+
 def test_the_scores_and_the_links_of_a_run_are_not_computed_again(tmp_path):
     photos = two_walks(tmp_path / "photos")
     config = PipelineConfig(retrieval=RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=1, min_score=30))

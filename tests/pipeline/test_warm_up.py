@@ -69,12 +69,23 @@ def test_an_interruption_ends_the_processes(monkeypatch):
     started = []
 
     class Interrupted(subprocess.Popen):
-        def communicate(self, *args, **kwargs):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, **kwargs)
             started.append(self)
+
+        def communicate(self, *args, **kwargs):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(subprocess, "Popen", Interrupted)
     monkeypatch.setattr(warm_up, "_COMPILE", "import time; time.sleep(600)")
     with pytest.raises(KeyboardInterrupt):
         warm_up._in_processes([["pair"], ["models"]])
-    assert sys.platform == "win32" or started[0].returncode == -9
+    assert sys.platform == "win32" or [worker.returncode for worker in started] == [-9, -9]
+
+
+def test_a_process_that_cannot_be_started_is_told_as_a_warning(cache, monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "executable", str(cache / "no python"))
+    compile_kernels(told.append, threads=2)
+    assert told[-1].level == "warning"
+    assert not is_complete(cache)
