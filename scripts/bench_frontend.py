@@ -23,6 +23,7 @@ import dataclasses
 import importlib.util
 import itertools
 import json
+import os
 import sys
 import tempfile
 import time
@@ -65,6 +66,9 @@ Pose = tuple[np.ndarray, np.ndarray]
 
 def main() -> int:
     options = parse_options()
+    if "OPENBLAS_NUM_THREADS" not in os.environ:  # as the command sets it, which must be before NumPy is loaded
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+        os.execv(sys.executable, [sys.executable, "-m", "scripts.bench_frontend", *sys.argv[1:]])
     rows = list({"stages": stages, "pose": poses, "pairs": pairs_of_pool}[options.part](options))
     if options.json:
         report = {"part": options.part, "environment": environment(options.threads), "results": rows}
@@ -245,14 +249,12 @@ def estimators(max_error_px: float) -> dict[str, Callable[[Pair], Pose | None]]:
         return found.cam2_from_cam1.rotation.matrix, np.asarray(found.cam2_from_cam1.translation)
 
     def magsac(pair: Pair) -> Pose | None:
-        rays1, rays2 = rays(pair.points1, pair.camera1), rays(pair.points2, pair.camera2)
-        threshold = max_error_px / pair.camera1.mean_focal_length
-        eye = np.eye(3)
+        K = pair.camera1.calibration_matrix  # one camera took all images of these sets
         cv2.setRNGSeed(0)
-        E, inliers = cv2.findEssentialMat(rays1[:, :2], rays2[:, :2], eye, cv2.USAC_MAGSAC, 0.9999, threshold)
+        E, inliers = cv2.findEssentialMat(pair.points1, pair.points2, K, cv2.USAC_MAGSAC, 0.9999, max_error_px)
         if E is None or E.shape != (3, 3):
             return None
-        _, R, t, _ = cv2.recoverPose(E, rays1[:, :2], rays2[:, :2], eye, mask=inliers)
+        _, R, t, _ = cv2.recoverPose(E, pair.points1, pair.points2, K, mask=inliers)
         return R, t.ravel()
 
     def colmap(pair: Pair) -> Pose | None:
