@@ -199,12 +199,9 @@ def true_pairs(name: str, options: argparse.Namespace) -> Iterator[Pair]:
     searchable = [SearchableFeatures(f) for f in features]
     for i, j in itertools.combinations(range(len(features)), 2):
         rows = match_features(searchable[i], searchable[j]).indices
-        pair = Pair(
-            features[i].points2D[rows[:, 0]],
-            features[j].points2D[rows[:, 1]],
-            *(truth.cameras[int(truth.image_camera_ids[k])] for k in (i, j)),
-            relative_pose(truth, i, j),
-        )
+        camera1, camera2 = (truth.cameras[int(truth.image_camera_ids[k])] for k in (i, j))
+        points1, points2 = features[i].points2D[rows[:, 0]], features[j].points2D[rows[:, 1]]
+        pair = Pair(points1, points2, camera1, camera2, relative_pose(truth, i, j))
         if agreeing(pair) >= MIN_AGREEING:
             yield pair
 
@@ -260,11 +257,11 @@ def estimators(max_error_px: float) -> dict[str, Callable[[Pair], Pose | None]]:
     def colmap(pair: Pair) -> Pose | None:
         options = pycolmap.RANSACOptions()
         options.max_error = max_error_px
-        cameras = [
+        camera1, camera2 = (
             pycolmap.Camera(model=c.model, width=c.width, height=c.height, params=c.params)
             for c in (pair.camera1, pair.camera2)
-        ]
-        found = pycolmap.estimate_essential_matrix(pair.points1, pair.points2, *cameras, options)
+        )
+        found = pycolmap.estimate_essential_matrix(pair.points1, pair.points2, camera1, camera2, options)
         if not found:
             return None
         pose = found["cam2_from_cam1"]
