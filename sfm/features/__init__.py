@@ -1,5 +1,6 @@
 """Image in, keypoints with descriptors out."""
 
-from sfm.features.sift import FeatureConfig, extract_features
+from sfm.features.config import FeatureConfig
+from sfm.features.extraction import extract_features, working_memory_bytes
 
-__all__ = ["FeatureConfig", "extract_features"]
+__all__ = ["FeatureConfig", "extract_features", "working_memory_bytes"]

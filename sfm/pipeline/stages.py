@@ -21,8 +21,7 @@ from sfm.core.errors import ImageError, Rejected
 from sfm.core.events import FeaturesExtracted, Observer, PairMatched, PairVerified, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
 from sfm.core.scene import Features, Matches, TwoViewGeometry
-from sfm.features import extract_features
-from sfm.features.sift import working_memory_bytes
+from sfm.features import extract_features, working_memory_bytes
 from sfm.io.database import Database, Decision
 from sfm.io.images import read_image
 from sfm.matching import SearchableFeatures, match_features
