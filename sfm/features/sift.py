@@ -10,12 +10,15 @@ Reference:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from sfm.features.config import FeatureConfig
-from sfm.features.keypoints import Described, Selection, from_cv2
+from sfm.features.keypoints import Described, Selection
+from sfm.features.opencv import from_cv2
 
 _DESCRIPTOR_SCALE = 512.0
 
@@ -24,6 +27,8 @@ def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: S
     """Keypoints that `select` keeps of all that are found, in px of `grey`, and their descriptors (N, 128)."""
     detector = _detector(config)
     found = detector.detect(grey, None)
+    if config.upright:
+        found = _upright(found)
     keypoints = from_cv2(found)
     rows = select(keypoints)
     if not len(rows):
@@ -39,6 +44,14 @@ def sift_memory_bytes(width: float, height: float, config: FeatureConfig) -> int
     all octaves together take 4/3 of the first.
     """
     return int(4 * width * height * 4 * (2 * config.octave_layers + 5) * 4 / 3)
+
+
+def _upright(found: Sequence[cv2.KeyPoint]) -> list[cv2.KeyPoint]:
+    """Each place and scale once, without an orientation."""
+    once = {(k.pt, k.size): k for k in found}
+    for keypoint in once.values():
+        keypoint.angle = 0.0
+    return list(once.values())
 
 
 def _detector(config: FeatureConfig) -> cv2.SIFT:
