@@ -22,7 +22,9 @@ class FeatureConfig:
     kind: FeatureKind = "sift"
     """Who finds and describes them: `sift`; `orb`, `akaze`, `brisk` with binary descriptors of their own; the corners
     of `harris`, `shi_tomasi`, `fast` at one scale with those of `corner_descriptor`; the networks `aliked`, `disk` from
-    the file `model`. Of two photos of house fronts SIFT brings two to six times the verified matches of the others."""
+    the file `model`. Against 2,349 verified matches of SIFT with a near photo of a house front and 609 with one from
+    the side, of 8,000 features, ORB brings 1,993 and 200, AKAZE 1,819 and 338, BRISK 1,425 and 266, corners with BRIEF
+    some 2,300 and 480; ORB in a sixth of the time, AKAZE in a quarter, corners in a third."""
 
     max_image_size: int = 1600
     """Longest side in px to which larger images are reduced before detection; 0 keeps the full size. On the
