@@ -14,7 +14,7 @@ from sfm.core.arrays import Points2D, Value, readonly
 class DescriptorKind(IntEnum):
     """How descriptors are compared; the values are the numbers in the type column of a database.
 
-    COLMAP knows 0, and takes the others for undefined.
+    COLMAP knows 0, and has no name for the others: it reads them, but does not match them for its own.
     """
 
     SIFT = 0
