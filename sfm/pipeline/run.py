@@ -59,7 +59,7 @@ def reconstruct(
         Database.open(workspace / "database.db") as database,
         _one_cv2_thread(),
     ):
-        scene = read_scene(database, images_folder, config.cameras, threads=threads, observer=tell)
+        scene = read_scene(database, images_folder, config.cameras, threads=threads, observer=tell, masks=config.masks)
         # Only now: settings that do not fit the photos must not be kept for the next run.
         write_text(workspace / "sfm.toml", to_toml(config))
         run = Run(database, config, threads, tell, scene.images)
