@@ -1,6 +1,6 @@
 """Verified matches between photos of which one was spoilt, with and without preparation.
 
-    python -m scripts.bench_prepare FOLDER... [--size 800] [--step 1] [--json FILE]
+    python -m scripts.bench_prepare FOLDER... [--size 800] [--step 1] [--modes off auto] [--json FILE]
 
 Of each folder two pairs of photos that follow each other are taken. The first photo of a pair is spoilt in known ways
 (dark, flat, noisy, specks), the second stays as it is. Matches that verification accepts are counted for every mode of
@@ -104,10 +104,11 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--size", type=int, default=800)
     parser.add_argument("--step", type=int, default=1)
+    parser.add_argument("--modes", nargs="+", default=list(get_args(PrepareMode)), help="off must be the first")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    modes = [*get_args(PrepareMode), "lowered contrast"]
+    modes = [*options.modes, "lowered contrast"]
     counts: dict[str, list[list[int]]] = {name: [] for name in SPOILS}
     for first, second in (pair for folder in options.folders for pair in pairs_of(folder, options.step)):
         grey1, grey2 = reduced(first, options.size), reduced(second, options.size)

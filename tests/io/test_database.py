@@ -166,7 +166,9 @@ def test_pairs_that_only_a_watermark_holds_are_not_linked(database: Database) ->
 
 
 @pytest.mark.parametrize("kind", list(DescriptorKind))
-def test_the_kind_of_descriptors_is_kept_and_colmap_takes_none_but_sift_for_its_own(database: Database, rng, kind) -> None:
+def test_the_kind_of_descriptors_is_kept_and_colmap_takes_none_but_sift_for_its_own(
+    database: Database, rng, kind
+) -> None:
     features = random_features(5, rng, 61 if kind == DescriptorKind.BINARY else 128)
     database.write_features(2, dataclasses.replace(features, kind=kind))
     read = database.read_features(2)
