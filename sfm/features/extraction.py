@@ -22,6 +22,7 @@ from sfm.features.binary import detect_akaze, detect_brisk, detect_orb
 from sfm.features.config import SMALLEST_SIDE_PX, FeatureConfig
 from sfm.features.corners import detect_corners
 from sfm.features.keypoints import Described, Selection, as_features
+from sfm.features.learned import detect_learned
 from sfm.features.selection import Selector
 from sfm.features.sift import detect_sift, sift_memory_bytes
 
@@ -131,7 +132,8 @@ def _detect(grey: np.ndarray, config: FeatureConfig, select: Selection) -> Descr
             return detect_brisk(grey, config, select)
         case "harris" | "shi_tomasi" | "fast":
             return detect_corners(grey, config, select)
-    raise AssertionError(config.kind)
+        case "aliked" | "disk":
+            return detect_learned(grey, config, select)
 
 
 def descriptor_kind(config: FeatureConfig) -> DescriptorKind:

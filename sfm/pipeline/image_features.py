@@ -89,7 +89,7 @@ def model_digest(config: FeatureConfig) -> str:
     """What stands for the content of the file of a network; empty where features need none.
 
     Raises:
-        ConfigError: the file is missing or cannot be read.
+        ConfigError: there is no such file.
     """
     if config.kind not in ("aliked", "disk"):
         return ""

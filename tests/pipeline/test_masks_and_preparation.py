@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm.core.errors import ConfigError, ImageError, InputError
+from sfm.core.errors import ConfigError, ImageError, InputError, ReconstructionError
 from sfm.core.events import Note
 from sfm.features import FeatureConfig
 from sfm.io.database import Database
@@ -73,7 +74,7 @@ def test_preparation_is_recorded_and_finds_more_in_flat_photos(photos, tmp_path)
     for path in photos.iterdir():
         image = cv2.imread(str(path))
         write_photo(path, (110 + 0.08 * image).astype(np.uint8))
-    plain, _ = run_or_none(photos, tmp_path / "off")
+    plain = features_without_preparation(photos, tmp_path / "off")
     with run(photos, tmp_path / "auto", PipelineConfig(prepare=PrepareConfig(mode="auto")))[0] as database:
         prepared = database.feature_counts()[1]
         (row,) = [d for d in database.ledger("photo0.png") if d.gate == "preparation"]
@@ -87,16 +88,12 @@ def test_preparation_is_recorded_and_finds_more_in_flat_photos(photos, tmp_path)
     assert row.value < row.threshold == 0.02
 
 
-def run_or_none(photos: Path, workspace: Path) -> tuple[int, None]:
+def features_without_preparation(photos: Path, workspace: Path) -> int:
     """Number of features of the first photo, whether or not that suffices for a model."""
-    from sfm.core.errors import ReconstructionError
-
-    try:
+    with contextlib.suppress(ReconstructionError):
         run(photos, workspace)[0].close()
-    except ReconstructionError:
-        pass
     with Database.open(workspace / "database.db", readonly=True) as database:
-        return database.feature_counts()[1], None
+        return database.feature_counts()[1]
 
 
 def test_binary_features_go_through_the_pipeline(photos, tmp_path):
