@@ -93,9 +93,9 @@ def verified(grey1: np.ndarray, other: Features, size2: tuple[int, int], config:
     if isinstance(found, Rejected):
         return 0
     matches = match_features(found.features, other)
-    cameras = [infer_camera("SIMPLE_RADIAL", shape[1], shape[0], None) for shape in (grey1.shape, size2)]
+    camera1, camera2 = (infer_camera("SIMPLE_RADIAL", s[1], s[0], None) for s in (grey1.shape, size2))
     rng = np.random.default_rng(0)
-    geometry = verify_pair(found.features.points2D, other.points2D, matches, *cameras, rng=rng)
+    geometry = verify_pair(found.features.points2D, other.points2D, matches, camera1, camera2, rng=rng)
     return 0 if isinstance(geometry, Rejected) else len(geometry)
 
 
