@@ -12,8 +12,9 @@ import numpy as np
 from numba import njit
 
 _MOVES = 5
+_BLOCK = 64
 _ORIENTATION_BINS = 36
-_PEAKS = 4
+_MARGIN = 3
 _CELLS, _DIRECTIONS, _SAMPLES_A_CELL = 4, 8, 4
 _SAMPLES = (_CELLS + 1) * _SAMPLES_A_CELL
 
@@ -25,35 +26,29 @@ def find_extrema(stack, threshold, border, found):
     Fills `found` (N, 3) up to its end and returns how many there are, which may be more.
     """
     differences, height, width = stack.shape[0] - 1, stack.shape[1], stack.shape[2]
-    padded = (width + 7) // 8 * 8
     rows = np.zeros((3, differences, width), np.float32)
     high, low = np.empty((differences, width), np.float32), np.empty((differences, width), np.float32)
     highest, lowest = np.empty(width, np.float32), np.empty(width, np.float32)
-    flags = np.zeros(padded, np.uint8)
-    words = flags.view(np.uint64)
+    flags = np.zeros(width + _BLOCK, np.uint8)
     count = 0
     for bottom in range(border - 1, height - border + 1):
-        here = rows[bottom % 3]
         for k in range(differences):
-            upper, lower, row = stack[k + 1, bottom], stack[k, bottom], here[k]
-            for x in range(width):
-                row[x] = upper[x] - lower[x]
+            _subtract(stack[k + 1, bottom], stack[k, bottom], rows[bottom % 3, k])
         y = bottom - 1
         if y < border:
             continue
         for k in range(differences):
-            a, b, c, top, down = rows[0, k], rows[1, k], rows[2, k], high[k], low[k]
-            for x in range(width):
-                largest = a[x] if a[x] > b[x] else b[x]
-                top[x] = largest if largest > c[x] else c[x]
-                smallest = a[x] if a[x] < b[x] else b[x]
-                down[x] = smallest if smallest < c[x] else c[x]
+            _extremes(rows[0, k], rows[0, k], rows[1, k], rows[1, k], rows[2, k], rows[2, k], high[k], low[k])
         for k in range(1, differences - 1):
-            _extrema_of_row(rows[y % 3, k], high[k - 1 : k + 2], low[k - 1 : k + 2], highest, lowest, threshold, border, flags)
-            for word in range(len(words)):
-                if words[word] == 0:
+            _extremes(high[k - 1], low[k - 1], high[k], low[k], high[k + 1], low[k + 1], highest, lowest)
+            _flag(rows[y % 3, k], highest, lowest, threshold, border, flags)
+            for start in range(0, width, _BLOCK):
+                flagged = 0
+                for x in range(_BLOCK):
+                    flagged += flags[start + x]
+                if flagged == 0:
                     continue
-                for x in range(8 * word, 8 * word + 8):
+                for x in range(start, start + _BLOCK):
                     if flags[x] != 0:
                         if count < len(found):
                             found[count, 0], found[count, 1], found[count, 2] = k, y, x
@@ -62,27 +57,34 @@ def find_extrema(stack, threshold, border, found):
 
 
 @njit(cache=True, nogil=True)
-def _extrema_of_row(row, high, low, highest, lowest, threshold, border, flags):
-    """Sets a flag where a value is the largest or the smallest of its 27; `high` and `low` are of the columns."""
-    width = len(row)
-    a, b, c = high[0], high[1], high[2]
-    for x in range(width):
-        largest = a[x] if a[x] > b[x] else b[x]
-        highest[x] = largest if largest > c[x] else c[x]
-    a, b, c = low[0], low[1], low[2]
-    for x in range(width):
-        smallest = a[x] if a[x] < b[x] else b[x]
-        lowest[x] = smallest if smallest < c[x] else c[x]
-    # Slices, since a negative index counts from the end: what may be one keeps a loop from being vectorised.
-    size = width - 2 * border
-    middle, flag = row[border : border + size], flags[border : border + size]
+def _subtract(a, b, out):
+    for x in range(len(out)):
+        out[x] = a[x] - b[x]
+
+
+@njit(cache=True, nogil=True)
+def _extremes(a_high, a_low, b_high, b_low, c_high, c_low, high, low):
+    """The largest and the smallest of three rows each, column by column."""
+    for x in range(len(high)):
+        largest = a_high[x] if a_high[x] > b_high[x] else b_high[x]
+        high[x] = largest if largest > c_high[x] else c_high[x]
+        smallest = a_low[x] if a_low[x] < b_low[x] else b_low[x]
+        low[x] = smallest if smallest < c_low[x] else c_low[x]
+
+
+@njit(cache=True, nogil=True)
+def _flag(row, highest, lowest, threshold, border, flags):
+    """Marks what is the largest or the smallest of its 27; `highest` and `lowest` are those of the columns."""
+    # Slices, since an index that might be negative keeps a loop from being vectorised: it counts from the end.
+    size = len(row) - 2 * border
+    middle, out = row[border : border + size], flags[border : border + size]
     a, b, c = highest[border - 1 : border - 1 + size], highest[border : border + size], highest[border + 1 :]
     d, e, f = lowest[border - 1 : border - 1 + size], lowest[border : border + size], lowest[border + 1 :]
     for x in range(size):
         value = middle[x]
         is_highest = (value > threshold) & (value >= a[x]) & (value >= b[x]) & (value >= c[x])
         is_lowest = (value < -threshold) & (value <= d[x]) & (value <= e[x]) & (value <= f[x])
-        flag[x] = is_highest | is_lowest
+        out[x] = is_highest | is_lowest
 
 
 @njit(cache=True, nogil=True)
@@ -103,7 +105,11 @@ def refine_extrema(stack, found, count, min_contrast, max_edge_ratio, border, re
                 for j in range(3):
                     for m in range(3):
                         d[i, j, m] = stack[k + i, y + j - 1, x + m - 1] - stack[k + i - 1, y + j - 1, x + m - 1]
-            gx, gy, gs = 0.5 * (d[1, 1, 2] - d[1, 1, 0]), 0.5 * (d[1, 2, 1] - d[1, 0, 1]), 0.5 * (d[2, 1, 1] - d[0, 1, 1])
+            gx, gy, gs = (
+                0.5 * (d[1, 1, 2] - d[1, 1, 0]),
+                0.5 * (d[1, 2, 1] - d[1, 0, 1]),
+                0.5 * (d[2, 1, 1] - d[0, 1, 1]),
+            )
             twice = 2 * d[1, 1, 1]
             xx = d[1, 1, 2] + d[1, 1, 0] - twice
             yy = d[1, 2, 1] + d[1, 0, 1] - twice
@@ -145,14 +151,16 @@ def orientations(stack, keypoints, scales, angles):
     peaks of a histogram with a Gaussian window of 1.5 σ that reach 0.8 of the highest.
     """
     height, width = stack.shape[1], stack.shape[2]
-    bins, half = np.float32(_ORIENTATION_BINS), np.float32(0.5)
-    raw, smooth = np.empty(_ORIENTATION_BINS + 1, np.float32), np.empty(_ORIENTATION_BINS, np.float32)
+    bins, rounding = np.float32(_ORIENTATION_BINS), np.float32(_MARGIN + 0.5)
+    # Bins count from `_MARGIN`: before and after the circle there is room for its continuation.
+    raw, smooth = np.empty(_ORIENTATION_BINS + 2 * _MARGIN), np.empty(_ORIENTATION_BINS + 2 * _MARGIN)
     for n in range(len(keypoints)):
-        angles[n, :] = np.nan
         image = stack[round(keypoints[n, 2])]
         column, line = round(keypoints[n, 0]), round(keypoints[n, 1])
         radius = round(4.5 * scales[n])
-        window = np.exp(-(np.arange(-radius, radius + 1) ** 2) / (4.5 * scales[n] ** 2)).astype(np.float32)
+        window = np.empty(2 * radius + 1, np.float32)
+        for i in range(2 * radius + 1):
+            window[i] = math.exp(-((i - radius) ** 2) / (4.5 * scales[n] ** 2))
         raw[:] = 0
         left, right = max(column - radius, 1), min(column + radius, width - 2)
         size = right - left + 1
@@ -168,23 +176,28 @@ def orientations(stack, keypoints, scales, angles):
                 gy[i] = weight * (below[i] - above[i])
             _to_polar(gx, gy)
             for i in range(size):
-                raw[np.uint32(gy[i] * bins + half)] += gx[i]
-        raw[0] += raw[_ORIENTATION_BINS]
-        angles_of_peaks(raw, smooth, angles[n])
+                raw[np.uint32(gy[i] * bins + rounding)] += gx[i]
+        raw[_MARGIN] += raw[_MARGIN + _ORIENTATION_BINS]
+        peak_angles(raw, smooth, angles[n])
 
 
 @njit(cache=True, nogil=True)
-def angles_of_peaks(raw, smooth, angles):
+def peak_angles(raw, smooth, angles):
     """The directions of the peaks of a circular histogram, after smoothing, by parabolas through three bins."""
-    bins = len(smooth)
-    for b in range(bins):
-        near, far = raw[(b + bins - 1) % bins] + raw[(b + 1) % bins], raw[(b + bins - 2) % bins] + raw[(b + 2) % bins]
-        smooth[b] = 6 * raw[b] + 4 * near + far
-    highest, peaks = smooth.max(), 0
-    for b in range(bins):
-        before, after = smooth[(b + bins - 1) % bins], smooth[(b + 1) % bins]
-        if smooth[b] > before and smooth[b] > after and smooth[b] >= 0.8 * highest and peaks < len(angles):
-            vertex = b + 0.5 * (before - after) / (before + after - 2 * smooth[b])
+    bins = len(raw) - 2 * _MARGIN
+    for b in range(_MARGIN):
+        raw[b], raw[_MARGIN + bins + b] = raw[bins + b], raw[_MARGIN + b]
+    highest = 0.0
+    for b in range(_MARGIN - 1, _MARGIN + bins + 1):
+        smooth[b] = 6 * raw[b] + 4 * (raw[b - 1] + raw[b + 1]) + raw[b - 2] + raw[b + 2]
+        if smooth[b] > highest:
+            highest = smooth[b]
+    peaks = 0
+    angles[:] = np.nan
+    for b in range(_MARGIN, _MARGIN + bins):
+        before, here, after = smooth[b - 1], smooth[b], smooth[b + 1]
+        if here > before and here > after and here >= 0.8 * highest and peaks < len(angles):
+            vertex = b - _MARGIN + 0.5 * (before - after) / (before + after - 2 * here)
             angles[peaks] = vertex * 2 * math.pi / bins
             peaks += 1
 

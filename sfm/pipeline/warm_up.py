@@ -18,6 +18,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from sfm.core.arrays import Points2D
@@ -27,6 +28,7 @@ from sfm.core.events import Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import Features, Matches, PairKind, Reconstruction, TwoViewGeometry, ViewGraph
+from sfm.features import extract_features
 from sfm.io.colmap_model import write_model
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
@@ -99,6 +101,12 @@ def run_parts(names: Sequence[str]) -> None:
         _PARTS[name]()
 
 
+def _features() -> None:
+    """Features of a small image of noise."""
+    noise = np.random.default_rng(0).normal(size=(64, 64))
+    extract_features(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8))
+
+
 def _pair() -> None:
     """Matching and verification of two images, with known and with unknown focal lengths."""
     descriptors = np.random.default_rng(0).integers(0, 90, (8, 128), dtype=np.uint8)
@@ -135,7 +143,7 @@ def _models() -> list[Reconstruction]:
     return models
 
 
-_PARTS = {"pair": _pair, "models": _models}
+_PARTS = {"pair": _pair, "models": _models, "features": _features}
 
 
 def _camera(calibrated: bool) -> Camera:
