@@ -191,7 +191,8 @@ def test_a_shifted_scene_gives_shifted_keypoints_without_bias(options, shift):
     exact = tuple(round(s * fine) / fine for s in shift)
     config = FeatureConfig(**options)
     first, second = extract_features(photo(0, 0), config), extract_features(photo(*exact), config)
-    assert isinstance(first, Features) and isinstance(second, Features)
+    assert isinstance(first, Features)
+    assert isinstance(second, Features)
     gaps = first.points2D[:, None] - exact - second.points2D[None]
     nearest = np.argmin(np.linalg.norm(gaps, axis=2), axis=1)
     errors = gaps[np.arange(len(first)), nearest]
