@@ -100,6 +100,7 @@ def refine_extrema(stack, found, count, min_contrast, max_edge_ratio, border, re
     for n in range(count):
         k, y, x = found[n, 0], found[n, 1], found[n, 2]
         settled = False
+        gx = gy = gs = dx = dy = ds = xx = yy = xy = 0.0
         for _ in range(_MOVES):
             for i in range(3):
                 for j in range(3):

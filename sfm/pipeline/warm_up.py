@@ -18,7 +18,6 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from sfm.core.arrays import Points2D
@@ -102,9 +101,9 @@ def run_parts(names: Sequence[str]) -> None:
 
 
 def _features() -> None:
-    """Features of a small image of noise."""
-    noise = np.random.default_rng(0).normal(size=(64, 64))
-    extract_features(cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8))
+    """Features of a small image of squares."""
+    squares = np.random.default_rng(0).integers(0, 255, (8, 8), dtype=np.uint8)
+    extract_features(np.kron(squares, np.ones((8, 8), np.uint8)))
 
 
 def _pair() -> None:

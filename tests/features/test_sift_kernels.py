@@ -18,8 +18,9 @@ BORDER = 5
 def noise(seed: int, height: int = 90, width: int = 121) -> np.ndarray:
     """Blobs of many sizes, uint8."""
     rng = np.random.default_rng(seed)
-    image = sum(s * cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), s) for s in (1.2, 2.4, 5.0))
-    return cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    blobs = [s * cv2.GaussianBlur(rng.normal(size=(height, width)), (0, 0), s) for s in (1.2, 2.4, 5.0)]
+    image = np.sum(blobs, axis=0)
+    return (255 * (image - image.min()) / np.ptp(image)).astype(np.uint8)
 
 
 def stack_of(seed: int) -> np.ndarray:
@@ -94,7 +95,8 @@ def orientation_twin(image: np.ndarray, x: float, y: float, sigma: float) -> lis
                 size, angle = polar_twin(image, v, u)
                 weight = math.exp(-((v - round(y)) ** 2 + (u - round(x)) ** 2) / (2 * (1.5 * sigma) ** 2))
                 histogram[round(angle / (2 * math.pi) * 36) % 36] += weight * size
-    smooth = sum(w * np.roll(histogram, shift) for shift, w in zip((-2, -1, 0, 1, 2), (1, 4, 6, 4, 1), strict=True))
+    weighted = [w * np.roll(histogram, shift) for shift, w in zip((-2, -1, 0, 1, 2), (1, 4, 6, 4, 1), strict=True)]
+    smooth = np.sum(weighted, axis=0)
     angles = []
     for b in range(36):
         before, here, after = smooth[b - 1], smooth[b], smooth[(b + 1) % 36]
@@ -177,11 +179,12 @@ def test_a_shifted_scene_gives_shifted_keypoints_without_bias(options, shift):
     """Both photos are means over the pixels of a scene 8 times finer, so that the shift is exact."""
     rng = np.random.default_rng(4)
     height, width, fine = 400, 500, 8
-    scene = sum(
-        s * cv2.resize(rng.normal(size=(440 // s, 540 // s)), (540 * fine, 440 * fine), interpolation=cv2.INTER_CUBIC)
-        for s in (3, 6, 12)
-    )
-    scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX).astype(np.float32)
+    size = 540 * fine, 440 * fine
+    blobs = [
+        s * cv2.resize(rng.normal(size=(440 // s, 540 // s)), size, interpolation=cv2.INTER_CUBIC) for s in (3, 6, 12)
+    ]
+    scene = np.sum(blobs, axis=0).astype(np.float32)
+    scene = 255 * (scene - scene.min()) / np.ptp(scene)
 
     def photo(x: float, y: float) -> np.ndarray:
         left, top = round((10 + x) * fine), round((10 + y) * fine)
