@@ -17,6 +17,7 @@ COMMANDS = {
     "pairs": "the next: which pairs of photos are to be matched",
     "match": "the next: matches of these pairs",
     "verify": "the next: which matches a rigid scene explains, and how",
+    "inspect": "photos: sharpness, exposure, EXIF, copies, what cannot be read",
     "view": "look at a workspace in the Rerun viewer",
     "compare": "pose errors of a model against a reference",
     "convert": "a model from one format to another: COLMAP binary, text, PLY",
