@@ -7,6 +7,7 @@ verification, missing links are tried as long as they bring anything.
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 
@@ -23,11 +24,34 @@ STAGE = "pairs"
 _NOTE = "pair_scores"
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class PairChoice:
+    """The pairs to be matched before anything is verified, sorted, and why these, for a person."""
+
+    pairs: Sequence[Pair]
+    why: str
+
+
+def first_pairs(run: Run, feature_keys: Mapping[int, str]) -> PairChoice:
+    """The pairs with which `match_and_verify` begins."""
+    config = run.config.retrieval
+    ids = _usable(run)
+    if len(ids) <= config.exhaustive_up_to:
+        return PairChoice(exhaustive_pairs(ids), f"all are compared of up to {config.exhaustive_up_to} images")
+    ids = sorted(ids, key=lambda image_id: natural_key(run.images[image_id].name))
+    scores = _scores(run, feature_keys, ids)
+    pairs = sorted((min(ids[i], ids[j]), max(ids[i], ids[j])) for i, j in promising_pairs(scores, config))
+    why = (
+        f"those that share at least {config.min_score} of their {config.probes} largest features, "
+        f"the {config.partners} best partners of each image and its {config.neighbors} neighbours on each side"
+    )
+    return PairChoice(pairs, why)
+
+
 def match_and_verify(run: Run, feature_keys: Mapping[int, str]) -> tuple[dict[Pair, str], dict[Pair, str]]:
     """Matches and geometry of the pairs that are worth it; returns the key of each pair in both stages."""
-    counts, config = run.database.feature_counts(), run.config.retrieval
-    usable = [image_id for image_id in run.images if counts.get(image_id)]
-    if len(usable) <= config.exhaustive_up_to:
+    usable = _usable(run)
+    if len(usable) <= run.config.retrieval.exhaustive_up_to:
         match_keys = match_all(run, feature_keys, exhaustive_pairs(usable))
         pair_keys = verify_all(run, match_keys)
         run.database.clear_ledger(STAGE)
@@ -35,6 +59,12 @@ def match_and_verify(run: Run, feature_keys: Mapping[int, str]) -> tuple[dict[Pa
         match_keys, pair_keys = _in_rounds(run, feature_keys, usable)
     forget_other_pairs(run, match_keys)
     return match_keys, pair_keys
+
+
+def _usable(run: Run) -> list[int]:
+    """The images that have features."""
+    counts = run.database.feature_counts()
+    return [image_id for image_id in run.images if counts.get(image_id)]
 
 
 def _in_rounds(
