@@ -23,7 +23,7 @@ from sfm.pipeline.manifest import write_manifest
 from sfm.pipeline.memory import peak_memory_bytes
 from sfm.pipeline.models import map_all
 from sfm.pipeline.observers import LogFiles, watched
-from sfm.pipeline.pairs import match_and_verify
+from sfm.pipeline.pairs import check_pair_settings, match_and_verify
 from sfm.pipeline.report import RunReport, figures_of, no_model_error
 from sfm.pipeline.scene import Scene, read_scene
 from sfm.pipeline.stages import Run, extract_all
@@ -60,9 +60,10 @@ def reconstruct(
         _one_cv2_thread(),
     ):
         scene = read_scene(database, images_folder, config.cameras, threads=threads, observer=tell)
+        run = Run(database, config, threads, tell, scene.images)
+        check_pair_settings(run)
         # Only now: settings that do not fit the photos must not be kept for the next run.
         write_text(workspace / "sfm.toml", to_toml(config))
-        run = Run(database, config, threads, tell, scene.images)
         compile_kernels(tell, threads=threads)
         feature_keys = extract_all(run)
         match_keys, pair_keys = match_and_verify(run, feature_keys)

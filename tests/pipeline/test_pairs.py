@@ -47,7 +47,7 @@ def test_pairs_of_different_places_are_left_out_and_no_others(tmp_path):
 
 def test_what_the_first_look_misses_is_tried_while_it_helps(tmp_path):
     photos = two_walks(tmp_path / "photos")
-    blind = RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=1, min_score=10**6, retries=1)
+    blind = RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=1, min_votes=10**6, retries=1)
     told = run(photos, tmp_path / "ws", PipelineConfig(retrieval=blind))
     rounds = [total for stage, total in _rounds(told) if stage == "matching"]
     assert rounds[0] == 9
@@ -60,7 +60,7 @@ def test_what_the_first_look_misses_is_tried_while_it_helps(tmp_path):
 
 
 def test_a_first_look_that_finds_nothing_is_not_the_end(tmp_path):
-    blind = RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=0, min_score=10**6)
+    blind = RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=0, min_votes=10**6)
     run(two_walks(tmp_path / "photos"), tmp_path / "ws", PipelineConfig(retrieval=blind))
     _, verified = _pairs(tmp_path / "ws")
     assert {(f"{walk}{k}.png", f"{walk}{k + 1}.png") for walk in "ab" for k in range(4)} <= verified
@@ -80,7 +80,7 @@ def test_fewer_photos_leave_no_stale_ledger_and_a_true_summary(tmp_path):
 
 def test_the_scores_and_the_links_of_a_run_are_not_computed_again(tmp_path):
     photos = two_walks(tmp_path / "photos")
-    config = PipelineConfig(retrieval=RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=1, min_score=30))
+    config = PipelineConfig(retrieval=RetrievalConfig(exhaustive_up_to=0, partners=0, neighbors=1, min_votes=30))
     run(photos, tmp_path / "ws", config)
     again = run(photos, tmp_path / "ws", config)
     assert again.work() == (0, 0, 0)
