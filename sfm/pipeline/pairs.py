@@ -23,24 +23,24 @@ from sfm.retrieval.choice import choose_method
 from sfm.retrieval.pairs import earth_centered_m, nearby_pairs, spatial_pairs
 from sfm.retrieval.sequence import sequence_pairs
 
-_SECONDS_PER_FEATURE = 7e-6
-"""Time to match and verify a pair on one core for each feature of an image: 30 ms at 4,000. For the estimate only."""
+_SECONDS_PER_PAIR, _SECONDS_PER_FEATURE = 0.015, 7e-6
+"""Time to match and verify a pair on one core: 43 ms at 4,000 features an image. For the estimate only."""
 
 _Choice = Callable[[PairScores], list[Pair]]
 
 
 def check_pair_settings(run: Run) -> None:
-    """Finds what is wrong with a user's list of pairs before the work begins.
+    """Finds what the chosen method lacks before the work begins.
 
     Raises:
         InputError: the file cannot be used.
-        ConfigError: the method is `list` and there is no file.
+        ConfigError: the method is `list` and there is no file, or `spatial` and no photo has a position.
     """
     config = run.config.retrieval
     if config.method == "list":
         _listed(run)
-    elif config.pair_list and config.method != "auto":
-        raise ConfigError(f"a pair_list does not go with the method {config.method}", remedy="use the method list")
+    elif config.method == "spatial" and not np.isfinite(_positions_m(run, list(run.images))).any():
+        raise ConfigError("none of the photos says where it was taken", remedy="let sfm choose the method: auto")
 
 
 def match_and_verify(run: Run, feature_keys: Mapping[int, str]) -> tuple[dict[Pair, str], dict[Pair, str]]:
@@ -48,9 +48,10 @@ def match_and_verify(run: Run, feature_keys: Mapping[int, str]) -> tuple[dict[Pa
     counts, config = run.database.feature_counts(), run.config.retrieval
     usable = [image_id for image_id in run.images if counts.get(image_id)]
     ids = sorted(usable, key=lambda image_id: natural_key(run.images[image_id].name))
+    few = config.exhaustive_up_to
     if config.method == "list":
         match_keys, pair_keys = _at_once(run, feature_keys, ids, _listed(run), "as listed")
-    elif config.method == "exhaustive" or (config.method == "auto" and len(ids) <= config.exhaustive_up_to):
+    elif len(ids) < 3 or config.method == "exhaustive" or (config.method == "auto" and len(ids) <= few):
         match_keys, pair_keys = _at_once(run, feature_keys, ids, exhaustive_pairs(ids), "all with all")
     else:
         match_keys, pair_keys = _in_rounds(run, feature_keys, ids)
@@ -121,8 +122,6 @@ def _chosen(run: Run, ids: Sequence[int], scores: PairScores) -> tuple[list[Pair
 
 def _near_or_similar(scores: PairScores, positions_m: np.ndarray, config: RetrievalConfig) -> list[Pair]:
     """Neighbours by position; for images that have none, and for neighbours by name, what they show decides."""
-    if not np.isfinite(positions_m).any():
-        raise ConfigError("none of the photos says where it was taken", remedy="let sfm choose the method: auto")
     lost = set(np.flatnonzero(np.isnan(positions_m).any(axis=1)).tolist())
     similar = [pair for pair in promising_pairs(scores, config) if lost.intersection(pair)]
     near = spatial_pairs(positions_m, config.spatial_partners, config.max_distance_m)
@@ -153,7 +152,7 @@ def _listed(run: Run) -> list[Pair]:
 def _announce(run: Run, ids: Sequence[int], pairs: int, why: str) -> None:
     counts = run.database.feature_counts()
     mean = np.mean([counts[image_id] for image_id in ids]) if ids else 0.0
-    seconds = pairs * mean * _SECONDS_PER_FEATURE / run.threads
+    seconds = pairs * (_SECONDS_PER_PAIR + mean * _SECONDS_PER_FEATURE) / run.threads
     told = f"{pairs} of {len(ids) * (len(ids) - 1) // 2} pairs are compared ({why})"
     run.observer(Note(message=f"{told}, about {_duration(float(seconds))} if all are new"))
 

@@ -3,8 +3,12 @@
 For each visual word the inverted file lists the features of all images that are this word. A feature of the query
 meets those on the list of its word alone, and votes for the images of those whose signatures nearly agree with its own.
 Two views of a place are turned against each other by about the same angle everywhere, so only the votes for the
-commonest turn count. The number of votes of unrelated images is that of chance, n² / words times the few per mille of
-signatures that agree by chance; words are taken in such a number that it is about one.
+commonest turn count.
+
+Images of n features that have nothing in common meet in n² / words pairs of features, of which a few in a thousand
+agree by chance. There are n² / 256 words, so that this is a vote or two whatever n; and more where all images together
+have so many features that the lists would grow beyond 256 on average. Then chance has less of a say, and fewer votes
+make a pair promising.
 
 The cost of an image is a product with 512 centres for each of its features and the lists of its words. Both are
 bounded, since the features of all images together are (`max_postings`): an image more costs no more than those before.
@@ -32,8 +36,10 @@ from sfm.retrieval.vocabulary import Vocabulary, quantize, train_vocabulary
 
 _TRAINED_WITH = 300_000
 _MOST_WORDS = 65_536
-_SQUARED_FEATURES_PER_WORD = 256
-"""4096 features of each image meet 65,536 words: 256 pairs of features of two images are in one word by chance."""
+_PER_WORD = 256
+"""Pairs of features of two images that are one word by chance; and features of all images that are one word."""
+_LEAST_SHARE = 0.4
+"""Of `min_votes`, where chance has no say."""
 _LONGEST = 8192
 """Features that one word may have. A word of more is on every image, such as the corner of a black border."""
 
@@ -96,7 +102,8 @@ def similar_images(
         pairs.append(np.stack([np.full(len(best), image), best], axis=1))
         scores.append(counted[best].astype(np.int64))
         on_image(image)
-    return summed_scores(images, np.concatenate(pairs), np.concatenate(scores), config.min_votes)
+    threshold = _threshold(np.mean([len(some) for some in words]), len(vocabulary), config)
+    return summed_scores(images, np.concatenate(pairs), np.concatenate(scores), threshold)
 
 
 def features_of_each(images: int, config: RetrievalConfig = RetrievalConfig()) -> int:
@@ -133,6 +140,12 @@ def votes(
     return counted
 
 
+def _threshold(features: float, words: int, config: RetrievalConfig) -> int:
+    """Votes that make a pair promising, for images of so many features in the mean."""
+    by_chance = min(1.0, features**2 / (_PER_WORD * words))
+    return round(config.min_votes * (_LEAST_SHARE + (1 - _LEAST_SHARE) * by_chance))
+
+
 def _trained(read: Callable[[int], Features], images: int, limit: int, rng: np.random.Generator) -> Vocabulary | None:
     """A vocabulary from evenly spaced features of all images; none where there are no features."""
     share, counts, sample = -(-_TRAINED_WITH // max(images, 1)), [], []
@@ -143,5 +156,5 @@ def _trained(read: Callable[[int], Features], images: int, limit: int, rng: np.r
         sample.append(rows[np.arange(taken) * len(rows) // max(taken, 1)])
     if not sum(counts):
         return None
-    words = min(int(np.mean(counts)) ** 2 // _SQUARED_FEATURES_PER_WORD, _MOST_WORDS)
+    words = min(int(max(np.mean(counts) ** 2, sum(counts))) // _PER_WORD, _MOST_WORDS)
     return train_vocabulary(np.concatenate([rows for rows in sample if len(rows)]), words, rng=rng)
