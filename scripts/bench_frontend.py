@@ -2,7 +2,6 @@
 
     python -m scripts.bench_frontend stages DATA [--sets fountain-P11 ...] [--max-image-size 1600] [--json FILE]
     python -m scripts.bench_frontend pose DATA [--sets fountain-P11 Herz-Jesus-P8] [--json FILE]
-    python -m scripts.bench_frontend pairs DATA [--folders RENDERED/orbit/images ...] [--json FILE]
 
 `stages` times extraction, matching and verification of a set from empty databases, pycolmap at its defaults and, with
 `--max-image-size`, both sides at that size. A round runs one side after the other; `--repeat` rounds, medians count.
@@ -11,9 +10,6 @@ Accuracy with the rest of the pipeline is the matter of bench_sfm.
 `pose` gives all estimators the same matches, ours, of pairs with at least 30 that agree with the true pose (4 px), and
 the true cameras; errors are the larger of the angles of rotation and translation. PoseLib is left out where it is not
 installed (`pip install poselib`).
-
-`pairs` pools the images of all sets and folders and tells which share of the pairs within a set that are verified with
-at least 30 inliers the cheap look finds promising, and which share is among the 20 best partners of either image.
 """
 
 from __future__ import annotations
@@ -34,14 +30,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
-from PIL import Image
 
 from scripts.bench_sfm import SETS, environment, image_names
 from sfm.core.cameras import Camera
-from sfm.core.cameras.priors import infer_camera
 from sfm.core.errors import Rejected
 from sfm.core.events import SILENT
-from sfm.core.execution import ordered_map
 from sfm.core.geometry.epipolar import essential_from_pose
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.robust import RansacConfig, estimate_relative_pose
@@ -55,8 +48,7 @@ from sfm.pipeline.config import DEFAULTS, with_settings
 from sfm.pipeline.scene import read_scene
 from sfm.pipeline.stages import Run, extract_all, match_all, verify_all
 from sfm.pipeline.warm_up import run_parts
-from sfm.retrieval import RetrievalConfig, exhaustive_pairs, pair_scores, probes_of, promising_pairs
-from sfm.verification import verify_pair
+from sfm.retrieval import exhaustive_pairs
 
 STAGE_SETS = ("fountain-P11", "Herz-Jesus-P8", "SceauxCastle", "lund", "middlebury_templeRing")
 POSE_SETS = ("fountain-P11", "Herz-Jesus-P8")
@@ -69,7 +61,7 @@ def main() -> int:
     if "OPENBLAS_NUM_THREADS" not in os.environ:  # as the command sets it, which must be before NumPy is loaded
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
         os.execv(sys.executable, [sys.executable, "-m", "scripts.bench_frontend", *sys.argv[1:]])
-    rows = list({"stages": stages, "pose": poses, "pairs": pairs_of_pool}[options.part](options))
+    rows = list({"stages": stages, "pose": poses}[options.part](options))
     if options.json:
         report = {"part": options.part, "environment": environment(options.threads), "results": rows}
         options.json.write_text(json.dumps(report, indent=1))
@@ -78,10 +70,9 @@ def main() -> int:
 
 def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("stages", "pose", "pairs"))
+    parser.add_argument("part", choices=("stages", "pose"))
     parser.add_argument("data", type=Path, help="folder of the image sets")
     parser.add_argument("--sets", nargs="+", choices=list(SETS))
-    parser.add_argument("--folders", nargs="*", type=Path, default=[], help="more images (part pairs)")
     parser.add_argument("--max-image-size", type=int, help="both sides; else each side's default")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeat", type=int, default=1)
@@ -300,64 +291,6 @@ def pose_error_deg(found: Pose | None, true: Rigid3) -> float:
     direction = np.asarray(true.translation) / np.linalg.norm(true.translation)
     translation = np.arccos(np.clip(t @ direction / np.linalg.norm(t), -1, 1))
     return float(np.rad2deg(max(rotation, translation)))
-
-
-# --- pairs ---------------------------------------------------------------------------------------------------------
-
-
-def pairs_of_pool(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """One row: how many of the true pairs the cheap look finds, and what it costs."""
-    folders = [options.data / SETS[name].images for name in options.sets or SETS] + options.folders
-    paths = [(k, path / name) for k, path in enumerate(folders) if path.is_dir() for name in image_names(path)]
-    cv2.setNumThreads(1)
-    features = list(ordered_map(features_of, [path for _, path in paths], threads=options.threads))
-    home = np.array([k for k, _ in paths])
-    true = true_links(features, home, [path for _, path in paths], options.threads)
-
-    if not true:
-        raise SystemExit("no two images of one set show the same place")
-
-    config = RetrievalConfig()
-    start = time.perf_counter()
-    scores = pair_scores([probes_of(f, config) for f in features], config, threads=options.threads)
-    seconds = time.perf_counter() - start
-    promising = set(promising_pairs(scores, config))
-    rank = np.argsort(np.argsort(-scores, axis=1, kind="stable"), axis=1, kind="stable")
-    best = {(i, j) for i, j in true if min(rank[i, j], rank[j, i]) < 20 and scores[i, j] > 0}
-    count = len(features) * (len(features) - 1) // 2
-    row = {
-        "images": len(features),
-        "pairs": count,
-        "true": len(true),
-        "promising": len(promising),
-        "found": len(true & promising) / len(true),
-        "found_among_20": len(best) / len(true),
-        "seconds": seconds,
-    }
-    print(f"{len(features)} images, {count} pairs, {len(true)} of them true; the look takes {seconds:.1f} s")
-    print(f"promising: {len(promising)} pairs, {100 * row['found']:.1f} % of the true ones")
-    print(f"among the 20 best partners: {100 * row['found_among_20']:.1f} %")
-    by_set = {folders[k].as_posix(): [p for p in true if home[p[0]] == k] for k in np.unique(home).tolist()}
-    for name, mine in by_set.items():
-        if mine:
-            print(f"  {100 * len(promising.intersection(mine)) / len(mine):5.1f} % of {len(mine):4}  {name}")
-    yield row
-
-
-def true_links(features: list[Features], home: np.ndarray, paths: list[Path], threads: int) -> set[tuple[int, int]]:
-    """Pairs of rows within a folder that are verified with at least `MIN_AGREEING` inliers."""
-    searchable = [SearchableFeatures(f) for f in features]
-    cameras = [infer_camera("SIMPLE_RADIAL", *Image.open(path).size) for path in paths]
-
-    def is_true(pair: tuple[int, int]) -> bool:
-        i, j = pair
-        matches = match_features(searchable[i], searchable[j])
-        rng = np.random.default_rng(pair)
-        found = verify_pair(features[i].points2D, features[j].points2D, matches, cameras[i], cameras[j], rng=rng)
-        return not isinstance(found, Rejected) and len(found) >= MIN_AGREEING
-
-    within = [(i, j) for i, j in itertools.combinations(range(len(features)), 2) if home[i] == home[j]]
-    return {pair for pair, good in zip(within, ordered_map(is_true, within, threads=threads), strict=True) if good}
 
 
 if __name__ == "__main__":

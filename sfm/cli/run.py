@@ -51,6 +51,12 @@ class SettingOptions:
     camera_per_image: Flag = False
     """Every photo has its own camera."""
 
+    pairs: Annotated[str | None, _arg("METHOD", "auto")] = None
+    """Which photos are compared: exhaustive, vocabulary, look, sequential (frames of a video), spatial (by GPS)."""
+
+    pair_list: Annotated[Path | None, _arg("FILE")] = None
+    """Compare the pairs of this file only: two names of photos a line."""
+
     seed: Annotated[int | None, _arg("N", "0")] = None
     """Of all random choices; the same seed gives the same result."""
 
@@ -107,6 +113,8 @@ def check(options: SettingOptions) -> None:
     sharing = [options.single_camera, options.camera_per_folder, options.camera_per_image]
     if sum(sharing) > 1:
         raise ConfigError("--single-camera, --camera-per-folder and --camera-per-image exclude each other")
+    if options.pair_list is not None and options.pairs not in (None, "list"):
+        raise ConfigError("--pairs and --pair-list exclude each other")
     if options.threads < 0:
         raise ConfigError(f"--threads must not be negative, got {options.threads}")
 
@@ -145,5 +153,10 @@ def _shortcuts(options: SettingOptions) -> Iterator[tuple[str, Any]]:
     ):
         if wanted:
             yield "cameras.sharing", sharing
+    if options.pairs is not None:
+        yield "retrieval.method", options.pairs.lower()
+    if options.pair_list is not None:
+        yield "retrieval.method", "list"
+        yield "retrieval.pair_list", str(options.pair_list.absolute())
     if options.seed is not None:
         yield "seed", options.seed

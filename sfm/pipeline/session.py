@@ -23,6 +23,7 @@ from sfm.io.database import Database
 from sfm.pipeline.config import PipelineConfig, to_toml
 from sfm.pipeline.lock import locked
 from sfm.pipeline.observers import LogFiles, watched
+from sfm.pipeline.pairs import check_pair_settings
 from sfm.pipeline.scene import Scene, read_scene
 from sfm.pipeline.stages import Run
 from sfm.pipeline.warm_up import compile_kernels
@@ -77,11 +78,13 @@ def session(
         _one_cv2_thread(),
     ):
         scene = read_scene(database, folder, config.cameras, threads=threads, observer=tell)
+        run = Run(database, config, threads, tell, scene.images)
+        check_pair_settings(run)
         database.set_meta(_FOLDER_NOTE, str(folder))
         # Only now: settings that do not fit the photos must not be kept for the next run.
         write_text(workspace / "sfm.toml", to_toml(config))
         compile_kernels(tell, threads=threads)
-        yield Session(workspace, folder, scene, Run(database, config, threads, tell, scene.images), times)
+        yield Session(workspace, folder, scene, run, times)
 
 
 def is_workspace(folder: Path) -> bool:

@@ -32,7 +32,7 @@ from sfm.io.colmap_model import write_model
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
 from sfm.matching import MatchingConfig, match_features
-from sfm.retrieval import pair_scores
+from sfm.retrieval import RetrievalConfig, similar_images
 from sfm.verification import verify_pair
 
 _IMAGES, _POINTS, _STRAYS = 6, 240, 24
@@ -113,7 +113,7 @@ def _pair() -> None:
     features = Features(np.zeros((8, 2)), zeros, zeros, descriptors)
     for exact_below in (3000, 0):
         match_features(features, features, MatchingConfig(exact_below=exact_below))
-    pair_scores([descriptors.astype(np.float32)] * 2)
+    similar_images(lambda image: features, 2, RetrievalConfig())
     for calibrated in (True, False):
         _verified(calibrated)
 
