@@ -32,6 +32,13 @@ class SettingOptions:
     max_image_size: Annotated[int | None, _arg("PX", "1600")] = None
     """Longest side to which larger photos are reduced when features are sought; 0 for full size."""
 
+    features: Annotated[str | None, _arg("NAME", "sift")] = None
+    """Who finds and describes features: sift, orb, akaze, brisk, harris, shi_tomasi, fast, aliked, disk."""
+
+    masks: Annotated[Path | None, _arg("DIR", "IMAGES/masks or IMAGES/../masks")] = None
+    """Masks, black where nothing shall be sought, called e.g. IMG.jpg.png, IMG.png, IMG_mask.png or mask_IMG.png for
+    IMG.jpg; none for no masks."""
+
     camera_model: Annotated[str | None, _arg("MODEL", "SIMPLE_RADIAL")] = None
     """COLMAP's name of a camera model, e.g. SIMPLE_PINHOLE, OPENCV, OPENCV_FISHEYE."""
 
@@ -140,6 +147,10 @@ def _shortcuts(options: SettingOptions) -> Iterator[tuple[str, Any]]:
     """The settings that have an option of their own."""
     if options.max_image_size is not None:
         yield "features.max_image_size", options.max_image_size
+    if options.features is not None:
+        yield "features.kind", options.features.lower()
+    if options.masks is not None:
+        yield "masks", "none" if str(options.masks) == "none" else str(options.masks.absolute())
     if options.camera_model is not None:
         yield "cameras.model", options.camera_model.upper()
     if options.intrinsics is not None:

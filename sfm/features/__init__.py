@@ -1,6 +1,6 @@
 """Image in, keypoints with descriptors out."""
 
 from sfm.features.config import FeatureConfig
-from sfm.features.extraction import extract_features, working_memory_bytes
+from sfm.features.extraction import Extraction, descriptor_kind, extract, extract_features, working_memory_bytes
 
-__all__ = ["FeatureConfig", "extract_features", "working_memory_bytes"]
+__all__ = ["Extraction", "FeatureConfig", "descriptor_kind", "extract", "extract_features", "working_memory_bytes"]

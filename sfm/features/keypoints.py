@@ -6,12 +6,11 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from sfm.core.arrays import Indices, Points2D
-from sfm.core.scene import Features
+from sfm.core.scene import DescriptorKind, Features
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -43,21 +42,6 @@ Described: TypeAlias = tuple[Keypoints, UInt8[np.ndarray, "N D"]]
 """Keypoints, and the descriptor of each."""
 
 
-def from_cv2(keypoints: Sequence[cv2.KeyPoint], scale_of_size: float = 0.5) -> Keypoints:
-    """OpenCV's keypoints, whose coordinates are 0 at the centre of the first pixel.
-
-    Args:
-        scale_of_size: σ of a keypoint whose `size` is 1; SIFT's `size` is the diameter 2σ.
-    """
-    columns = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], np.float64).reshape(-1, 5)
-    return Keypoints(
-        columns[:, :2] + 0.5,
-        (columns[:, 2] * scale_of_size).astype(np.float32),
-        np.deg2rad(columns[:, 3]).astype(np.float32),
-        columns[:, 4].astype(np.float32),
-    )
-
-
 def in_reading_order(keypoints: Keypoints) -> Indices:
     """Rows in the order of (y, x, scale, orientation)."""
     x, y = keypoints.points2D.T
@@ -74,8 +58,17 @@ def strongest(keypoints: Keypoints, limit: int) -> Indices:
     return np.sort(np.concatenate([rows, first]))
 
 
+def joined(parts: Sequence[Keypoints]) -> Keypoints:
+    """The rows of all parts, one after the other."""
+    columns = zip(*((p.points2D, p.scales, p.orientations, p.responses) for p in parts), strict=True)
+    return Keypoints(*(np.concatenate(column) for column in columns))
+
+
 def as_features(
-    keypoints: Keypoints, descriptors: UInt8[np.ndarray, "N D"], full_from_reduced: tuple[float, float]
+    keypoints: Keypoints,
+    descriptors: UInt8[np.ndarray, "N D"],
+    kind: DescriptorKind,
+    full_from_reduced: tuple[float, float],
 ) -> Features:
     """Features in px of the full image, in reading order.
 
@@ -88,4 +81,4 @@ def as_features(
     scales = (keypoints.scales * np.mean(full_from_reduced)).astype(np.float32)
     full = Keypoints(points2D, scales, keypoints.orientations, keypoints.responses)
     order = in_reading_order(full)
-    return Features(points2D[order], scales[order], keypoints.orientations[order], descriptors[order])
+    return Features(points2D[order], scales[order], keypoints.orientations[order], descriptors[order], kind)

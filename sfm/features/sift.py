@@ -23,7 +23,7 @@ from jaxtyping import Float32, Float64, UInt8
 from sfm.core.arrays import FloatArray
 from sfm.features import _sift_kernels as kernels
 from sfm.features.config import FeatureConfig
-from sfm.features.keypoints import Described, Keypoints, Selection
+from sfm.features.keypoints import Described, Keypoints, Selection, strongest
 from sfm.features.scale_space import blur_of, octaves
 
 _DESCRIPTOR_SCALE = 512.0
@@ -58,8 +58,8 @@ class _Extrema:
 def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: Selection) -> Described:
     """Keypoints that `select` keeps of all that are found, in px of `grey`, and their descriptors (N, 128).
 
-    `select` is asked twice: about places, and then about these with their orientations, of which a place may have
-    several.
+    `select` is asked about places. Of their orientations, of which a place may have several, the `max_features` of
+    the strongest places are kept.
     """
     layers = config.octave_layers
     stacks = list(octaves(grey, layers, enlargement_of(max(grey.shape), config)))
@@ -76,9 +76,12 @@ def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: S
         )
 
     extrema = extrema[select(keypoints_of(extrema, np.zeros(len(extrema))))]
-    rows, angles = _oriented(stacks, extrema, layers)
+    if config.upright:
+        rows, angles = np.arange(len(extrema)), np.zeros(len(extrema))
+    else:
+        rows, angles = _oriented(stacks, extrema, layers)
     keypoints = keypoints_of(extrema[rows], angles)
-    kept = select(keypoints)
+    kept = strongest(keypoints, config.max_features)
     return keypoints[kept], _descriptors(stacks, extrema[rows[kept]], angles[kept], layers)
 
 
@@ -101,24 +104,15 @@ def sift_memory_bytes(width: float, height: float, config: FeatureConfig) -> int
 
 
 def _extrema(stacks: list[np.ndarray], config: FeatureConfig) -> _Extrema:
-    """All extrema; where they are too few, those of less contrast as well."""
-    threshold = config.contrast_threshold
-    while True:
-        found = [_extrema_of_octave(stack, threshold, config) for stack in stacks]
-        enough = sum(map(len, found)) >= config.enough_features
-        if enough or threshold / 2 < config.lowest_contrast:
-            break
-        threshold /= 2
+    found = [_extrema_of_octave(stack, config) for stack in stacks]
     numbers = np.repeat(np.arange(len(stacks)), [len(columns) for columns in found])
     return _Extrema(numbers, np.concatenate(found) if found else np.zeros((0, 4)))
 
 
-def _extrema_of_octave(
-    stack: Float32[np.ndarray, "K H W"], threshold: float, config: FeatureConfig
-) -> Float64[np.ndarray, "N 4"]:
+def _extrema_of_octave(stack: Float32[np.ndarray, "K H W"], config: FeatureConfig) -> Float64[np.ndarray, "N 4"]:
     # A difference of layers is a contrast divided by their number. At half the threshold a pixel may still be next to
     # a vertex above it.
-    limit = 255 * threshold / config.octave_layers
+    limit = 255 * config.contrast_threshold / config.octave_layers
     capacity = 1000 + int(_PLACES_A_PIXEL * stack[0].size)
     while True:
         found = np.empty((capacity, 3), np.int32)

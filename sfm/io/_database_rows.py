@@ -10,9 +10,11 @@ from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from sfm.core.scene import PairKind, TwoViewGeometry
+from sfm.core.scene import DescriptorKind, PairKind, TwoViewGeometry
 
 UNDEFINED_KIND = 0
+UNDEFINED_FEATURE = -1
+"""What imported features are that COLMAP knows nothing of; mostly SIFT of other programs."""
 # COLMAP's kinds beyond ours: 8, several geometries at once, and 9, calibrated through a rig.
 _FOREIGN_KINDS = {8: PairKind.UNCALIBRATED, 9: PairKind.CALIBRATED}
 
@@ -42,6 +44,15 @@ def scales_and_orientations(keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarr
         return np.zeros(len(keypoints), np.float32), np.zeros(len(keypoints), np.float32)
     a11, a12, a21, a22 = keypoints[:, 2:].T
     return (np.hypot(a11, a21) + np.hypot(a12, a22)) / 2, np.arctan2(a21, a11)
+
+
+def descriptor_kind(number: int) -> DescriptorKind:
+    if number == UNDEFINED_FEATURE:
+        return DescriptorKind.SIFT
+    try:
+        return DescriptorKind(number)
+    except ValueError as error:
+        raise ValueError(f"they are of type {number}, which Parallax does not know") from error
 
 
 def _matrix_blob(matrix: np.ndarray | None) -> bytes | None:

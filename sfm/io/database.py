@@ -36,7 +36,6 @@ __all__ = ["Database", "Decision", "ImageRow", "ImageSource", "as_stored", "pair
 
 _PAIR_BASE = 2**31 - 1
 _CAMERA_SENSOR = 0
-_SIFT, _UNDEFINED_FEATURE = 0, -1
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -206,7 +205,6 @@ class Database(Bookkeeping):
         """Stores the features of an image in place of earlier ones; `as_stored` is what will be read back."""
         keypoints = np.column_stack([features.points2D, features.scales, features.orientations]).astype("<f4")
         rows, width = features.descriptors.shape
-        kind = _SIFT if width == 128 else _UNDEFINED_FEATURE
         with self.transaction():
             self._execute(
                 "INSERT OR REPLACE INTO keypoints(image_id, rows, cols, data) VALUES (?, ?, ?, ?)",
@@ -214,7 +212,7 @@ class Database(Bookkeeping):
             )
             self._execute(
                 "INSERT OR REPLACE INTO descriptors(image_id, type, rows, cols, data) VALUES (?, ?, ?, ?, ?)",
-                (image_id, kind, rows, width, features.descriptors.tobytes()),
+                (image_id, int(features.kind), rows, width, features.descriptors.tobytes()),
             )
 
     def read_features(self, image_id: int) -> Features:
@@ -227,12 +225,17 @@ class Database(Bookkeeping):
             ValueError: the image has none.
         """
         keypoints = self._keypoints(image_id)
-        rows = self._fetch("SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,))
+        rows = self._fetch("SELECT type, rows, cols, data FROM descriptors WHERE image_id = ?", (image_id,))
         if not rows:
             raise ValueError(f"image {image_id} has keypoints but no descriptors")
+        kind, count, width, blob = rows[0]
         with self._reading(f"the descriptors of image {image_id}"):
-            descriptors = rows_.array(rows[0][2], np.uint8, rows[0][:2])
-            return Features(keypoints[:, :2].astype(np.float64), *rows_.scales_and_orientations(keypoints), descriptors)
+            return Features(
+                keypoints[:, :2].astype(np.float64),
+                *rows_.scales_and_orientations(keypoints),
+                rows_.array(blob, np.uint8, (count, width)),
+                rows_.descriptor_kind(kind),
+            )
 
     def read_keypoints(self, image_id: int) -> Points2D:
         """Only the positions of an image's features, in px.

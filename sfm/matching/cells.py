@@ -17,10 +17,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32, Int64, UInt64
 
 from sfm.core.scene import Features
 from sfm.matching import _kernels
+from sfm.matching.binary import packed
 
 _CELL = 64
 _ROUNDS = 3
@@ -55,8 +56,9 @@ class SearchableFeatures:
     """The descriptors of an image with what searches need, which is computed once for all of its pairs."""
 
     def __init__(self, features: Features) -> None:
-        self.descriptors = features.descriptors
+        self.descriptors, self.kind = features.descriptors, features.kind
         self._cells: Cells | None = None
+        self._words: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.descriptors)
@@ -67,6 +69,13 @@ class SearchableFeatures:
         if self._cells is None:
             self._cells = sort_into_cells(self.descriptors.astype(np.float32))
         return self._cells
+
+    @property
+    def words(self) -> UInt64[np.ndarray, "N W"]:
+        """The bits of binary descriptors, 64 at once."""
+        if self._words is None:
+            self._words = packed(self.descriptors)
+        return self._words
 
     @property
     def has_cells(self) -> bool:

@@ -7,7 +7,8 @@ neither on the BLAS library nor on its threads, and ties are true ties, which th
 The ratio is taken of Euclidean distances. For neighbours as near as matches are it equals the ratio of angles, which
 COLMAP uses, to within a per cent.
 
-Images with many features are searched through an index (see `cells`), whose distances are exact as well.
+Images with many features are searched through an index (see `cells`), whose distances are exact as well. Binary
+descriptors are compared by their different bits (see `binary`).
 """
 
 from __future__ import annotations
@@ -16,16 +17,17 @@ import dataclasses
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Num
 
 from sfm.core.errors import ConfigError
-from sfm.core.scene import Features, Matches
+from sfm.core.scene import DescriptorKind, Features, Matches
 from sfm.matching import _kernels
+from sfm.matching.binary import nearest_bits
 from sfm.matching.cells import Cells, SearchableFeatures
 
 _BLOCK_ROWS = 256
 """Rows of the table of distances at a time: 12 MB for 12,000 features, which stays in the cache of a core."""
-_DESCRIPTOR_NORM = 512.0
+_DESCRIPTOR_NORM = {DescriptorKind.SIFT: 512.0, DescriptorKind.LEARNED: 256.0}
 _EXACT_BELOW = 2**24
 
 _Nearest: TypeAlias = tuple[np.ndarray, ...]
@@ -43,6 +45,10 @@ class MatchingConfig:
     max_distance: float = 0.7
     """Largest distance, for descriptors of unit length. COLMAP's value; only rows far from all others feel it."""
 
+    max_bits: float = 0.3
+    """Largest share of different bits, for binary descriptors. Those of different places differ in nearly a half, with
+    a spread of a tenth."""
+
     mutual: bool = True
     """Each of the two features must be the other's match. Without it image 1 chooses alone, and several of its
     features may match the same one."""
@@ -55,7 +61,14 @@ class MatchingConfig:
     """Cells in which the match of a feature is looked for. With 10, one match in 150 is missed, for half as much time
     again."""
 
+    hashed_above: int = 50000
+    """Binary features an image above which only those that share a hash are compared (see `binary`)."""
+
     def __post_init__(self) -> None:
+        if not 0 < self.max_bits <= 1:
+            raise ConfigError(f"max_bits must be in (0, 1], got {self.max_bits}")
+        if self.hashed_above < 0:
+            raise ConfigError(f"hashed_above must not be negative, got {self.hashed_above}")
         if self.exact_below < 0:
             raise ConfigError(f"exact_below must not be negative, got {self.exact_below}")
         if self.cells_searched < 1:
@@ -76,18 +89,23 @@ def match_features(
     Where an image has many pairs, `SearchableFeatures` of it spare preparing its descriptors for each.
 
     Raises:
-        ValueError: the descriptors differ in length, or are too long for exact arithmetic.
+        ValueError: the descriptors differ in kind or length, or are too long for exact arithmetic.
     """
     image1, image2 = _searchable(features1), _searchable(features2)
-    best1, second1, index1, best2, second2, index2 = _two_nearest(image1, image2, config)
-    accepted1 = _accepted(best1, second1, config)
+    _check(image1, image2)
+    match image1.kind:
+        case DescriptorKind.BINARY:
+            found = nearest_bits(image1.words, image2.words, config.hashed_above)
+            largest, ratio = config.max_bits * 8 * image1.descriptors.shape[1], config.max_ratio
+        case DescriptorKind.SIFT | DescriptorKind.LEARNED as kind:
+            found = _two_nearest(image1, image2, config)
+            largest, ratio = (config.max_distance * _DESCRIPTOR_NORM[kind]) ** 2, config.max_ratio**2
+    best1, second1, index1, best2, second2, index2 = found
+    rows = np.flatnonzero(_accepted(best1, second1, ratio, largest))
     if config.mutual:
-        accepted2 = _accepted(best2, second2, config)
-        rows = np.flatnonzero(accepted1)
+        accepted2 = _accepted(best2, second2, ratio, largest)
         partners = index1[rows]
         rows = rows[accepted2[partners] & (index2[partners] == rows)]
-    else:
-        rows = np.flatnonzero(accepted1)
     return Matches(np.stack([rows, index1[rows]], axis=1).astype(np.int32))
 
 
@@ -95,20 +113,24 @@ def _searchable(features: Features | SearchableFeatures) -> SearchableFeatures:
     return features if isinstance(features, SearchableFeatures) else SearchableFeatures(features)
 
 
-def _accepted(
-    best: Float32[np.ndarray, " N"], second: Float32[np.ndarray, " N"], config: MatchingConfig
-) -> Bool[np.ndarray, " N"]:
-    """Squared distances to the nearest and the second nearest that make a match; infinite where there is none."""
-    limit = (config.max_distance * _DESCRIPTOR_NORM) ** 2
-    return (best < config.max_ratio**2 * second.astype(np.float64)) & (best <= limit)
-
-
-def _two_nearest(image1: SearchableFeatures, image2: SearchableFeatures, config: MatchingConfig) -> _Nearest:
+def _check(image1: SearchableFeatures, image2: SearchableFeatures) -> None:
+    if image1.kind != image2.kind:
+        raise ValueError(f"descriptors must be of one kind, got {image1.kind.name} and {image2.kind.name}")
     lengths = image1.descriptors.shape[1], image2.descriptors.shape[1]
     if lengths[0] != lengths[1]:
         raise ValueError(f"descriptors must have the same length, got {lengths[0]} and {lengths[1]}")
-    if 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
+    if image1.kind != DescriptorKind.BINARY and 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
         raise ValueError(f"descriptors may have up to 128 dimensions, got {lengths[0]}")
+
+
+def _accepted(
+    best: Num[np.ndarray, " N"], second: Num[np.ndarray, " N"], ratio: float, largest: float
+) -> Bool[np.ndarray, " N"]:
+    """Distances to the nearest and the second nearest that make a match; beyond all limits where there is none."""
+    return (best < ratio * second.astype(np.float64)) & (best <= largest)
+
+
+def _two_nearest(image1: SearchableFeatures, image2: SearchableFeatures, config: MatchingConfig) -> _Nearest:
     if len(image1) * len(image2) < max(1, config.exact_below**2):
         return _nearest_of_all(image1.descriptors, image2.descriptors)
     return _nearest_in_cells(image1.cells, image2.cells, config.cells_searched)

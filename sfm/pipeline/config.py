@@ -20,6 +20,7 @@ from sfm.core.errors import ConfigError
 from sfm.features import FeatureConfig
 from sfm.mapping import MappingConfig
 from sfm.matching import MatchingConfig
+from sfm.prepare import PrepareConfig
 from sfm.retrieval import RetrievalConfig
 from sfm.verification import VerificationConfig
 
@@ -55,11 +56,15 @@ class PipelineConfig:
     """The settings of all stages; the same settings and photos give the same bytes."""
 
     cameras: CameraConfig = dataclasses.field(default_factory=CameraConfig)
+    prepare: PrepareConfig = dataclasses.field(default_factory=PrepareConfig)
     features: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
     retrieval: RetrievalConfig = dataclasses.field(default_factory=RetrievalConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
     verification: VerificationConfig = dataclasses.field(default_factory=VerificationConfig)
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
+    masks: str = ""
+    """Folder of masks, black where nothing shall be sought (see `sfm.io.masks`); empty for a folder called masks in
+    that of the photos or beside it, if there is one; none for no masks."""
     seed: int = 0
     """Of all random choices."""
 

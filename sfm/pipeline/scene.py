@@ -22,9 +22,11 @@ from sfm.io.camera_files import read_intrinsics
 from sfm.io.database import Database, Decision, ImageSource
 from sfm.io.exif import ImageInfo, prior_focal_px, read_image_info
 from sfm.io.images import check_size, list_images, read_image_bytes
+from sfm.io.masks import check_mask_size, find_masks, masks_folder, photos_among
 from sfm.pipeline.config import CameraConfig
+from sfm.pipeline.image_features import MaskFile, SceneImage
 from sfm.pipeline.intrinsics import assigned_cameras
-from sfm.pipeline.stages import SceneImage
+from sfm.pipeline.keys import file_digest
 
 _STAGE = "images"
 _NAMED_AT_MOST = 5
@@ -46,15 +48,20 @@ class _Photo:
     source: ImageSource
 
 
-def read_scene(database: Database, folder: Path, config: CameraConfig, *, threads: int, observer: Observer) -> Scene:
-    """Looks at the photos, gives each a camera, and brings the database up to date.
+def read_scene(
+    database: Database, folder: Path, config: CameraConfig, *, threads: int, observer: Observer, masks: str = ""
+) -> Scene:
+    """Looks at the photos, gives each a camera and its mask, and brings the database up to date.
 
+    Args:
+        masks: as `PipelineConfig.masks`.
     Raises:
-        InputError: there are no usable photos.
+        InputError: there are no usable photos, or masks that do not fit them.
         ConfigError: the given intrinsics do not fit them.
     """
-    listing = list_images(folder)
-    observer(StageStarted(stage=_STAGE, total=len(listing.names) + len(listing.skipped)))
+    listing, masks_in = list_images(folder), masks_folder(folder, masks)
+    names = photos_among(listing.names, folder, masks_in)
+    observer(StageStarted(stage=_STAGE, total=len(names) + len(listing.skipped)))
     skipped = dict(listing.skipped)
     for name, reason in skipped.items():
         observer(ImageRead(name=name, reason=reason))
@@ -65,7 +72,7 @@ def read_scene(database: Database, folder: Path, config: CameraConfig, *, thread
     def look(name: str) -> _Photo | ImageError:
         return _look(folder, name, sources.get(known.get(name, -1)))
 
-    for name, photo in zip(listing.names, ordered_map(look, listing.names, threads=threads), strict=True):
+    for name, photo in zip(names, ordered_map(look, names, threads=threads), strict=True):
         if isinstance(photo, ImageError):
             skipped[name] = photo.cause
         else:
@@ -76,6 +83,7 @@ def read_scene(database: Database, folder: Path, config: CameraConfig, *, thread
     if skipped:
         observer(Note(message=f"skipped {_named(skipped)}", level="warning"))
     groups = _given_groups(photos, config) if config.intrinsics else _groups(photos, config, observer)
+    masks_of = _masks(photos, folder, masks_in, observer) if masks_in else {}
     with database.transaction():
         images = _synchronize(database, photos, groups)
         database.clear_ledger(_STAGE)
@@ -85,7 +93,23 @@ def read_scene(database: Database, folder: Path, config: CameraConfig, *, thread
     cameras = len({image.camera_id for image in images.values()})
     told = f", skipped: {len(skipped)}" if skipped else ""
     observer(StageFinished(stage=_STAGE, summary=f"photos: {len(photos)}, cameras: {cameras}{told}"))
+    images = {k: dataclasses.replace(image, mask=masks_of.get(image.name)) for k, image in images.items()}
     return Scene(images, dict(sorted(skipped.items())))
+
+
+def _masks(photos: Sequence[_Photo], folder: Path, masks_in: Path, observer: Observer) -> dict[str, MaskFile]:
+    """The mask of each photo that has one, in the size of the photo."""
+    found = find_masks([photo.name for photo in photos], folder, masks_in)
+    masks: dict[str, MaskFile] = {}
+    for photo in photos:
+        if photo.name in found:
+            path = found[photo.name]
+            check_mask_size(path, photo.name, photo.info.width, photo.info.height)
+            masks[photo.name] = MaskFile(path, file_digest(path))
+    without = [photo.name for photo in photos if photo.name not in masks]
+    told = f"; without one: {_listed(without)}" if without else ""
+    observer(Note(message=f"masks from {masks_in}: {len(masks)}{told}", level="warning" if without else "info"))
+    return masks
 
 
 def _look(folder: Path, name: str, known: ImageSource | None) -> _Photo | ImageError:
@@ -192,6 +216,11 @@ def _no_photos(folder: Path, skipped: Mapping[str, str]) -> InputError:
     if not skipped:
         return InputError("there are no photos in this folder", path=folder, remedy="name the folder that holds them")
     return InputError(f"none of {len(skipped)} files is a usable photo ({_named(skipped)})", path=folder)
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f", +{len(names) - _NAMED_AT_MOST} more" if len(names) > _NAMED_AT_MOST else ""
+    return ", ".join(names[:_NAMED_AT_MOST]) + more
 
 
 def _named(skipped: Mapping[str, str]) -> str:

@@ -77,7 +77,7 @@ def session(
         Database.open(workspace / DATABASE) as database,
         _one_cv2_thread(),
     ):
-        scene = read_scene(database, folder, config.cameras, threads=threads, observer=tell)
+        scene = read_scene(database, folder, config.cameras, threads=threads, observer=tell, masks=config.masks)
         run = Run(database, config, threads, tell, scene.images)
         check_pair_settings(run)
         database.set_meta(_FOLDER_NOTE, str(folder))

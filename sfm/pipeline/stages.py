@@ -10,22 +10,21 @@ import dataclasses
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import TypeVar
 
 import cv2
 import numpy as np
 
-from sfm.core.cameras import Camera
-from sfm.core.errors import ImageError, Rejected
+from sfm.core.errors import Rejected
 from sfm.core.events import FeaturesExtracted, Observer, PairMatched, PairVerified, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
-from sfm.core.scene import Features, Matches, TwoViewGeometry
-from sfm.features import extract_features, working_memory_bytes
-from sfm.io.database import Database, Decision
-from sfm.io.images import read_image
+from sfm.core.scene import Matches, TwoViewGeometry
+from sfm.features import working_memory_bytes
+from sfm.io.database import Database
 from sfm.matching import SearchableFeatures, match_features
 from sfm.pipeline.config import PipelineConfig
+from sfm.pipeline.image_features import STAGE as FEATURES
+from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, model_digest
 from sfm.pipeline.keys import code_digest, key_of
 from sfm.pipeline.memory import free_memory_bytes
 from sfm.verification import verify_pair
@@ -41,18 +40,6 @@ _MEMORY_GUESS_BYTES = 8 * 1024**3
 Pair = tuple[int, int]
 Result = TypeVar("Result")
 Item = TypeVar("Item", int, Pair)
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class SceneImage:
-    """An image of the run: its row in the database, its file and what stands for its content."""
-
-    image_id: int
-    name: str
-    path: Path
-    digest: str
-    camera_id: int
-    camera: Camera
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -72,27 +59,28 @@ class Run:
 
 def extract_all(run: Run) -> dict[int, str]:
     """Features of all images; returns the key of each."""
-    stage, config = "features", run.config.features
-    basis = key_of(code_digest("sfm.features", "sfm.io", "sfm.core"), cv2.__version__, config)
-    keys = {image_id: key_of(basis, image.digest) for image_id, image in run.images.items()}
+    stage, config = FEATURES, run.config.features
+    code = code_digest("sfm.prepare", "sfm.features", "sfm.io", "sfm.core")
+    basis = key_of(code, cv2.__version__, config, run.config.prepare, model_digest(config))
+    keys = {
+        image_id: key_of(basis, image.digest, *([image.mask.digest] if image.mask else []))
+        for image_id, image in run.images.items()
+    }
     counts = run.database.feature_counts()
     stale = _stale(run, stage, keys, present=counts)
     threads = _threads_that_fit(run, stale)
 
-    def compute(image_id: int) -> tuple[int, Features | Rejected]:
-        return image_id, _extract(run.images[image_id], run.config)
+    def compute(image_id: int) -> tuple[int, FoundFeatures]:
+        return image_id, find_features(run.images[image_id], run.config)
 
-    def write(result: tuple[int, Features | Rejected]) -> None:
-        image_id, features = result
+    def write(result: tuple[int, FoundFeatures]) -> None:
+        image_id, found = result
         name = run.images[image_id].name
-        rejected = isinstance(features, Rejected)
-        count = 0 if rejected else len(features)
-        run.database.write_features(image_id, _no_features() if rejected else features)
+        run.database.write_features(image_id, found.features)
         run.database.clear_ledger(stage, [name])
-        verdict, detail = (features.reason, features.detail) if rejected else ("kept", "")
-        run.database.record(Decision(stage, name, "keypoints", float(count), 1.0, verdict, detail))
+        run.database.record(*found.decisions)
         run.database.set_stage_keys(stage, {_label(image_id): keys[image_id]})
-        run.observer(FeaturesExtracted(name=name, count=count))
+        run.observer(FeaturesExtracted(name=name, count=len(found.features)))
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
     _keep_as_they_come(run.database, ordered_map(compute, stale, threads=threads), write)
@@ -171,19 +159,6 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     rejected = len(keys.keys() & run.database.rejected_pairs().keys())
     run.observer(StageFinished(stage=stage, summary=f"{len(keys) - rejected} of {len(keys)} pairs"))
     return keys
-
-
-def _extract(image: SceneImage, config: PipelineConfig) -> Features | Rejected:
-    try:
-        grey = read_image(image.path, gray=True)
-    except ImageError as error:
-        return Rejected("unreadable", error.cause)
-    return extract_features(grey, config.features)
-
-
-def _no_features() -> Features:
-    nothing = np.zeros(0, np.float32)
-    return Features(np.zeros((0, 2)), nothing, nothing, np.zeros((0, 128), np.uint8))
 
 
 def _threads_that_fit(run: Run, image_ids: Iterable[int]) -> int:

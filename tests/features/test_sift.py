@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 import pytest
 
@@ -10,24 +9,7 @@ from sfm.core.errors import ConfigError, Rejected
 from sfm.core.scene import Features
 from sfm.features import FeatureConfig, extract_features
 from sfm.features.sift import root_normalized
-
-
-def blob_image(centers, sigma: float, shape=(240, 320)) -> np.ndarray:
-    """Bright Gaussian spots at `centers`, px with the first pixel's centre at one half."""
-    y, x = np.mgrid[: shape[0], : shape[1]] + 0.5
-    image = np.full(shape, 60.0)
-    for cx, cy in centers:
-        image += 150 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2))
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
-
-
-def texture(seed: int, shape=(200, 260)) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    image = sum(
-        cv2.resize(rng.normal(size=(shape[0] // s, shape[1] // s)), shape[::-1], interpolation=cv2.INTER_CUBIC) * s
-        for s in (2, 4, 8, 16)
-    )
-    return np.clip(np.rint(128 + 6 * image), 0, 255).astype(np.uint8)
+from tests.features.rendering import blob_image, texture
 
 
 def extracted(image: np.ndarray, **options) -> Features:
@@ -114,7 +96,7 @@ def test_colour_is_read_as_grey():
 def test_extraction_twice_gives_the_same_bits():
     first, second = extracted(texture(8)), extracted(texture(8))
     for field in dataclasses.fields(Features):
-        assert getattr(first, field.name).tobytes() == getattr(second, field.name).tobytes()
+        assert np.asarray(getattr(first, field.name)).tobytes() == np.asarray(getattr(second, field.name)).tobytes()
 
 
 @pytest.mark.parametrize(

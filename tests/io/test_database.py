@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import os
 import shutil
 import sqlite3
@@ -15,7 +17,7 @@ import pytest
 from sfm.core.cameras import MODELS, Camera
 from sfm.core.errors import FormatError, InputError, Rejected, WorkspaceLockedError
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
+from sfm.core.scene import DescriptorKind, Features, Matches, PairKind, TwoViewGeometry
 from sfm.io.database import Database, Decision, ImageRow, ImageSource, as_stored, pair_id, pair_of
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, np.array([500.0, 320.0, 240.0, 0.1]), has_prior_focal_length=True)
@@ -161,6 +163,22 @@ def test_pairs_that_only_a_watermark_holds_are_not_linked(database: Database) ->
     database.write_geometry(1, 3, TwoViewGeometry(PairKind.WATERMARK, matches))
     database.write_geometry(2, 3, Rejected("too_few_matches", "3 of 15"))
     assert database.linked_pairs() == ((1, 2),)
+
+
+@pytest.mark.parametrize("kind", list(DescriptorKind))
+def test_the_kind_of_descriptors_is_kept_and_colmap_takes_none_but_sift_for_its_own(
+    database: Database, rng, kind
+) -> None:
+    features = random_features(5, rng, 61 if kind == DescriptorKind.BINARY else 128)
+    database.write_features(2, dataclasses.replace(features, kind=kind))
+    read = database.read_features(2)
+    assert read.kind == kind
+    assert np.array_equal(read.descriptors, features.descriptors)
+    database.close()
+    with contextlib.closing(pycolmap.Database.open(database.path)) as theirs:
+        descriptors = theirs.read_descriptors(2)
+    assert (descriptors.type == pycolmap.FeatureExtractorType.SIFT) == (kind == DescriptorKind.SIFT)
+    assert np.array_equal(descriptors.data, features.descriptors)
 
 
 def test_an_image_without_features_is_not_one_without_extraction(database: Database, rng) -> None:

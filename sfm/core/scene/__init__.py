@@ -1,11 +1,12 @@
 """The products that stages hand on."""
 
-from sfm.core.scene.features import Features, Matches
+from sfm.core.scene.features import DescriptorKind, Features, Matches
 from sfm.core.scene.pairs import PairKind, TwoViewGeometry, ViewGraph
 from sfm.core.scene.reconstruction import Reconstruction, Tracks
 from sfm.core.scene.rigs import Frame, Rig
 
 __all__ = [
+    "DescriptorKind",
     "Features",
     "Frame",
     "Matches",

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
 from sfm.core.arrays import Points2D, Value, readonly
+
+
+class DescriptorKind(IntEnum):
+    """How descriptors are compared; the values are the numbers in the type column of a database.
+
+    COLMAP knows 0, and has no name for the others: it reads them, but does not match them for its own.
+    """
+
+    SIFT = 0
+    """By Euclidean distance; rows have length 512."""
+    BINARY = 100
+    """By the number of different bits, eight a column."""
+    LEARNED = 101
+    """By Euclidean distance; rows minus 128 have length 256."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -18,13 +33,15 @@ class Features(Value):
         points2D: keypoints in px of the image at full size, (0.5, 0.5) the centre of the first pixel.
         scales: σ of the keypoint in px, 0 where the detector knows none.
         orientations: radians, from x to y.
-        descriptors: (N, 128) uint8, √(L1-normalised) × 512 for SIFT.
+        descriptors: (N, 128) uint8, √(L1-normalised) × 512 for SIFT; (N, B) bytes for binary ones.
+        kind: of the descriptors. Only those of one kind can be compared.
     """
 
     points2D: Points2D
     scales: Float32[np.ndarray, " N"]
     orientations: Float32[np.ndarray, " N"]
     descriptors: UInt8[np.ndarray, "N D"]
+    kind: DescriptorKind = DescriptorKind.SIFT
 
     def __post_init__(self) -> None:
         n = len(self.points2D)
