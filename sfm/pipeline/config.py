@@ -22,6 +22,7 @@ from sfm.mapping import MappingConfig
 from sfm.matching import MatchingConfig
 from sfm.retrieval import RetrievalConfig
 from sfm.verification import VerificationConfig
+from sfm.viewgraph import CycleConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,7 @@ class PipelineConfig:
     retrieval: RetrievalConfig = dataclasses.field(default_factory=RetrievalConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
     verification: VerificationConfig = dataclasses.field(default_factory=VerificationConfig)
+    cycles: CycleConfig = dataclasses.field(default_factory=CycleConfig)
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
     seed: int = 0
     """Of all random choices."""
