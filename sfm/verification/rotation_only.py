@@ -61,8 +61,9 @@ def focal_factor_of_rotation(
             for matrix, is_free in zip((calibration1, calibration2), free, strict=True)
         )
         m = np.linalg.solve(k2, homography @ k1)
-        m = m / np.cbrt(np.linalg.det(m))[:, None, None]
-        costs = np.square(np.swapaxes(m, 1, 2) @ m - _IDENTITY).sum((1, 2))
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # of a singular H
+            m = m / np.cbrt(np.linalg.det(m))[:, None, None]
+            costs = np.square(np.swapaxes(m, 1, 2) @ m - _IDENTITY).sum((1, 2))
         if not np.isfinite(costs).any():
             return 1.0
         best = tried[np.nanargmin(costs)]
