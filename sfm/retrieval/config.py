@@ -40,8 +40,8 @@ class RetrievalConfig:
     """Images of most votes that are kept for each image."""
     min_votes: int = 10
     """Votes that make a pair promising; less, down to two fifths, where features are few for the size of the
-    vocabulary (see `sfm.retrieval.voting`). Of 2,840 pairs with 30 verified matches in 20 sets (370 images, 68,265 pairs)
-    this and `partners` keep 99.8 % among 6,654."""
+    vocabulary (see `sfm.retrieval.voting`). Of 2,840 pairs with 30 verified matches in a pool of 20 sets (370 images,
+    68,265 pairs) this and `partners` keep 99.8 % among 6,654."""
 
     probes: int = 300
     """Features of largest scale of each image that the method `look` compares."""

@@ -102,7 +102,7 @@ def similar_images(
         pairs.append(np.stack([np.full(len(best), image), best], axis=1))
         scores.append(counted[best].astype(np.int64))
         on_image(image)
-    threshold = _threshold(np.mean([len(some) for some in words]), len(vocabulary), config)
+    threshold = _threshold(float(np.mean([len(some) for some in words])), len(vocabulary), config)
     return summed_scores(images, np.concatenate(pairs), np.concatenate(scores), threshold)
 
 
