@@ -60,7 +60,7 @@ class RetrievalConfig:
     overlap: int = 10
     """Images before and after that the method `sequential` compares, and those at twice, four times … that distance
     up to `overlap` doublings away."""
-    loop_partners: int = 3
+    loop_partners: int = 5
     """Partners with most votes, far away in the order, that `sequential` adds for each image where a loop closes."""
 
     spatial_partners: int = 30
