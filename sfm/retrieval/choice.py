@@ -39,11 +39,11 @@ def choose_method(
     """
     if len(names) <= _MANY:
         return "vocabulary", "of few images what they show finds all pairs"
-    if numbered_like_frames(names) and len(set(sizes)) == 1 and views_follow(scores):
-        return "sequential", "numbered frames of one size, each view still there five frames later"
     located = np.isfinite(positions_m).all(axis=1)
     if located.mean() >= _LOCATED and spread_m(positions_m[located], config.spatial_partners) >= _SPREAD_M:
         return "spatial", f"{located.sum()} of {len(names)} images have a position"
+    if numbered_like_frames(names) and len(set(sizes)) == 1 and views_follow(scores):
+        return "sequential", "numbered frames of one size, each view still there five frames later"
     return "vocabulary", "no order and no positions to go by"
 
 

@@ -40,7 +40,7 @@ class RetrievalConfig:
     """Images of most votes that are kept for each image."""
     min_votes: int = 10
     """Votes that make a pair promising; less, down to two fifths, where features are few for the size of the
-    vocabulary (see `sfm.retrieval.voting`). Of 2,840 pairs with 30 verified matches in 20 sets (370 images,
+    vocabulary (see `sfm.retrieval.voting`). Of 2,840 pairs with 30 verified matches in a pool of 20 sets (370 images,
     68,265 pairs) this and `partners` keep 99.8 % among 6,654."""
 
     probes: int = 300
@@ -60,7 +60,7 @@ class RetrievalConfig:
     overlap: int = 10
     """Images before and after that the method `sequential` compares, and those at twice, four times … that distance
     up to `overlap` doublings away."""
-    loop_partners: int = 3
+    loop_partners: int = 5
     """Partners with most votes, far away in the order, that `sequential` adds for each image where a loop closes."""
 
     spatial_partners: int = 30

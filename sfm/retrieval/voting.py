@@ -79,7 +79,7 @@ def similar_images(
 
     Args:
         read: gives the features of an image 0 … images − 1; called twice for each, in this thread.
-        on_image: is told the number of each image when its votes are counted.
+        on_image: is told the number of each image when its words are known, which is nearly all of the work.
     Raises:
         ValueError: the descriptors are not SIFT-like (see `train_vocabulary`).
     """
@@ -89,7 +89,10 @@ def similar_images(
     if vocabulary is None:
         return summed_scores(images, np.zeros((0, 2), np.int64), np.zeros(0, np.int64), config.min_votes)
     shortened = (largest(read(image), limit) for image in range(images))
-    words = list(ordered_map(lambda features: words_of(vocabulary, features), shortened, threads=threads))
+    words: list[VisualWords] = []
+    for some in ordered_map(lambda features: words_of(vocabulary, features), shortened, threads=threads):
+        on_image(len(words))
+        words.append(some)
     inverted = inverted_file(words, len(vocabulary))
 
     def of_image(image: int) -> tuple[int, np.ndarray]:
@@ -101,7 +104,6 @@ def similar_images(
         best = best[counted[best] > 0]
         pairs.append(np.stack([np.full(len(best), image), best], axis=1))
         scores.append(counted[best].astype(np.int64))
-        on_image(image)
     threshold = _threshold(float(np.mean([len(some) for some in words])), len(vocabulary), config)
     return summed_scores(images, np.concatenate(pairs), np.concatenate(scores), threshold)
 

@@ -106,6 +106,7 @@ def test_the_method_follows_from_number_order_and_position():
         (video, several, NOWHERE, "vocabulary"),
         (photos, one, NOWHERE, "vocabulary"),
         (photos, one, grid, "spatial"),
+        (video, one, grid, "spatial"),  # a survey from the air is numbered too, but not a single line
         (photos, one, grid / 10, "vocabulary"),  # as dense as GPS is wrong
         (photos, one, np.where(np.arange(200)[:, None] % 2, grid, np.nan), "vocabulary"),
     ):

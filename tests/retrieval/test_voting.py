@@ -7,7 +7,7 @@ import pytest
 
 from sfm.retrieval import RetrievalConfig, similar_images
 from sfm.retrieval.vocabulary import k_means, nearest, quantize, train_vocabulary
-from sfm.retrieval.voting import VisualWords, features_of_each, inverted_file, votes
+from sfm.retrieval.voting import VisualWords, _threshold, features_of_each, inverted_file, votes
 from tests.retrieval.made_up import features_of, walk
 
 
@@ -144,3 +144,11 @@ def test_all_images_together_index_no_more_features_than_memory_is_meant_for():
         [features_of(rows) for rows in walk(12, seen=60)].__getitem__, 12, RetrievalConfig(candidates=1)
     )
     assert len(kept) <= 12
+
+
+def test_fewer_votes_make_a_pair_promising_where_words_are_many_for_the_features():
+    config = RetrievalConfig(min_votes=10)
+    assert _threshold(4096.0, 65_536, config) == _threshold(512.0, 1024, config) == 10
+    assert _threshold(512.0, 512, config) == 10
+    assert _threshold(1600.0, 65_536, config) == 5
+    assert _threshold(10.0, 65_536, config) == 4
