@@ -42,7 +42,8 @@ class FeatureConfig:
     0.04 finds half as many keypoints on house fronts. Detectors that measure something else take what corresponds."""
 
     min_features: int = 500
-    """An image in which fewer are found is searched again with half the contrast, up to three times; 0 never does."""
+    """An image in which fewer are found is searched again with half the contrast, up to three times; 0 never does. No
+    photo has lost verified matches by it (`scripts/bench_prepare.py`), and flat ones gain most of what they lack."""
 
     edge_threshold: float = 10.0
     """Largest ratio of principal curvatures; above it a keypoint slides along an edge. Lowe's value."""

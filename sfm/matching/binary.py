@@ -25,7 +25,8 @@ _BUCKET = 1
 """Features in a bucket on average, if their bits were independent."""
 
 Nearest: TypeAlias = tuple[np.ndarray, ...]
-"""Distance to the nearest, to the second nearest, and index of the nearest, for both directions."""
+"""Distance to the nearest (a number of bits, or squared), to the second nearest, and index of the nearest; for both
+directions."""
 
 
 def packed(descriptors: UInt8[np.ndarray, "N B"]) -> UInt64[np.ndarray, "N W"]:

@@ -18,10 +18,10 @@ import numpy as np
 from sfm.core.errors import Rejected
 from sfm.core.events import FeaturesExtracted, Observer, PairMatched, PairVerified, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
-from sfm.core.scene import Matches, TwoViewGeometry
+from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
 from sfm.features import working_memory_bytes
 from sfm.io.database import Database
-from sfm.matching import SearchableFeatures, match_features
+from sfm.matching import SearchableFeatures, match_features, match_guided
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.image_features import STAGE as FEATURES
 from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, model_digest
@@ -34,6 +34,9 @@ _CACHED_IMAGES = 128
 """Images whose features are held in memory for matching, up to 8 MB each."""
 _TILE = _CACHED_IMAGES // 2
 """Pairs are visited tile by tile, so that both sides of a tile fit into the cache."""
+
+_GUIDING = (PairKind.CALIBRATED, PairKind.UNCALIBRATED)
+"""Kinds of pairs that are matched again along their epipolar lines, if that is wanted."""
 
 _MEMORY_GUESS_BYTES = 8 * 1024**3
 
@@ -124,7 +127,9 @@ def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) 
 def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     """Two-view geometry of all matched pairs; returns the key of each pair."""
     stage, config, seed = "verification", run.config.verification, run.config.seed
-    basis = key_of(code_digest("sfm.verification", "sfm.core"), config, seed)
+    guided = run.config.matching.guided
+    guidance = (code_digest("sfm.matching"), run.config.matching) if guided else ()
+    basis = key_of(code_digest("sfm.verification", "sfm.core"), config, seed, *guidance)
     camera_keys = {image.camera_id: key_of(image.camera) for image in run.images.values()}
     keys = {
         (i, j): key_of(basis, i, j, key, *(camera_keys[run.images[k].camera_id] for k in (i, j)))
@@ -132,16 +137,31 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     }
     stale = _stale(run, stage, keys, present=run.database.verified_pairs())
     points2D = lru_cache(_CACHED_IMAGES)(run.database.read_keypoints)
+    features = lru_cache(_CACHED_IMAGES)(run.database.read_features)
 
-    def inputs() -> Iterator[tuple[Pair, np.ndarray, np.ndarray, Matches]]:
+    def inputs() -> Iterator[tuple[Pair, np.ndarray, np.ndarray, Matches, list[Features]]]:
         for i, j in _tiled(stale):
-            yield (i, j), points2D(i), points2D(j), run.database.read_matches(i, j)
+            described = [features(i), features(j)] if guided else []
+            yield (i, j), points2D(i), points2D(j), run.database.read_matches(i, j), described
 
-    def compute(item: tuple[Pair, np.ndarray, np.ndarray, Matches]) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
-        pair, points2D_1, points2D_2, matches = item
+    def compute(
+        item: tuple[Pair, np.ndarray, np.ndarray, Matches, list[Features]],
+    ) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
+        pair, points2D_1, points2D_2, matches, described = item
         camera1, camera2 = run.images[pair[0]].camera, run.images[pair[1]].camera
-        rng = np.random.default_rng([seed, *pair])
-        return pair, len(matches), verify_pair(points2D_1, points2D_2, matches, camera1, camera2, config, rng=rng)
+
+        def verified(matches: Matches) -> TwoViewGeometry | Rejected:
+            rng = np.random.default_rng([seed, *pair])
+            return verify_pair(points2D_1, points2D_2, matches, camera1, camera2, config, rng=rng)
+
+        geometry = verified(matches)
+        if guided and isinstance(geometry, TwoViewGeometry) and geometry.kind in _GUIDING:
+            more = match_guided(described[0], described[1], geometry, camera1, camera2, run.config.matching)
+            again = verified(more)
+            # What agrees with a geometry is no evidence for it: only more of the same is taken.
+            if isinstance(again, TwoViewGeometry) and again.kind == geometry.kind and len(again) > len(geometry):
+                geometry = again
+        return pair, len(matches), geometry
 
     def write(result: tuple[Pair, int, TwoViewGeometry | Rejected]) -> None:
         pair, matches, geometry = result

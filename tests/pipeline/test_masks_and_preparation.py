@@ -12,6 +12,8 @@ from sfm.core.errors import ConfigError, ImageError, InputError, ReconstructionE
 from sfm.core.events import Note
 from sfm.features import FeatureConfig
 from sfm.io.database import Database
+from sfm.matching import MatchingConfig
+from sfm.pipeline import stages
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.run import reconstruct
 from sfm.prepare import PrepareConfig
@@ -75,7 +77,11 @@ def test_preparation_is_recorded_and_finds_more_in_flat_photos(photos, tmp_path)
         image = cv2.imread(str(path))
         write_photo(path, (110 + 0.08 * image).astype(np.uint8))
     plain = features_without_preparation(photos, tmp_path / "off")
-    with run(photos, tmp_path / "auto", PipelineConfig(prepare=PrepareConfig(mode="auto")))[0] as database:
+    with run(
+        photos,
+        tmp_path / "auto",
+        PipelineConfig(prepare=PrepareConfig(mode="auto"), features=FeatureConfig(min_features=0)),
+    )[0] as database:
         prepared = database.feature_counts()[1]
         (row,) = [d for d in database.ledger("photo0.png") if d.gate == "preparation"]
     assert row.verdict == "stretch"
@@ -91,7 +97,7 @@ def test_preparation_is_recorded_and_finds_more_in_flat_photos(photos, tmp_path)
 def features_without_preparation(photos: Path, workspace: Path) -> int:
     """Number of features of the first photo, whether or not that suffices for a model."""
     with contextlib.suppress(ReconstructionError):
-        run(photos, workspace)[0].close()
+        run(photos, workspace, PipelineConfig(features=FeatureConfig(min_features=0)))[0].close()
     with Database.open(workspace / "database.db", readonly=True) as database:
         return database.feature_counts()[1]
 
@@ -112,3 +118,21 @@ def test_a_network_without_its_file_is_a_mistake_in_words(photos, tmp_path):
     for options in ({"kind": "aliked"}, {"kind": "disk", "model": str(tmp_path / "none.onnx")}):
         with pytest.raises(ConfigError, match=r"needs the file|no such file"):
             run(photos, tmp_path / "ws", PipelineConfig(features=FeatureConfig(**options)))
+
+
+def test_guided_matching_adds_what_agrees_with_a_verified_pair(photos, tmp_path, monkeypatch):
+    plausible = stages.verify_pair
+
+    def along_rows(*inputs, rng):
+        geometry = plausible(*inputs, rng=rng)
+        shift = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the photos are cuts side by side
+        return dataclasses.replace(geometry, F=shift) if geometry else geometry
+
+    monkeypatch.setattr(stages, "verify_pair", along_rows)
+    strict = MatchingConfig(max_ratio=0.6)
+
+    def inliers(name: str, matching: MatchingConfig) -> int:
+        with run(photos, tmp_path / name, PipelineConfig(matching=matching))[0] as database:
+            return sum(len(geometry) for geometry in database.read_view_graph().pairs.values())
+
+    assert inliers("guided", dataclasses.replace(strict, guided=True)) > 1.05 * inliers("plain", strict)

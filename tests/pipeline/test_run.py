@@ -18,7 +18,7 @@ from sfm.features import FeatureConfig
 from sfm.io.colmap_model import read_model
 from sfm.io.database import Database
 from sfm.matching import MatchingConfig
-from sfm.pipeline import stages
+from sfm.pipeline import image_features, stages
 from sfm.pipeline.config import CameraConfig, PipelineConfig
 from sfm.pipeline.run import reconstruct
 
@@ -239,8 +239,8 @@ def test_a_photo_that_fails_while_it_is_read_does_not_end_the_run(photos, tmp_pa
             raise ImageError("is broken inside", path=path)
         return original(path, **options)
 
-    original = stages.read_image
-    monkeypatch.setattr(stages, "read_image", failing)
+    original = image_features.read_image
+    monkeypatch.setattr(image_features, "read_image", failing)
     run(photos, tmp_path / "ws")
     with Database.open(tmp_path / "ws" / "database.db", readonly=True) as database:
         (decision,) = database.ledger("photo1.png", stage="features")
