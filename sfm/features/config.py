@@ -35,7 +35,9 @@ class FeatureConfig:
     error from 3.7 to 3.5 mm; matching takes twice the time, as it grows with the square."""
 
     spreading: Spreading = "strongest"
-    """Which are kept of more than `max_features`: the strongest, or the strongest of each part of the image (even)."""
+    """Which are kept of more than `max_features`: the strongest, or the strongest of each part of the image (even).
+    Even spreading brings 16 % more verified matches to the median pair of Herz-Jesus-P8, but poses that are not better
+    (AUC at 1° 89.8 instead of 91.7 with 12,000; 81.0 and 80.4 with 3,000; fountain-P11 77.2 and 76.5 with 3,000)."""
 
     contrast_threshold: float = 0.02
     """Smallest contrast of a keypoint, for grey values in [0, 1]. Half of OpenCV's default, and equal to COLMAP's:

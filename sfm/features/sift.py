@@ -122,8 +122,16 @@ def _extrema_of_octave(stack: Float32[np.ndarray, "K H W"], config: FeatureConfi
         capacity = count
     columns = np.empty((count, 4))
     kept = kernels.refine_extrema(stack, found, count, limit, config.edge_threshold, _BORDER_PX, columns)
-    columns[:kept, 3] *= config.octave_layers / 255
-    return columns[:kept]
+    columns = _once(columns[:kept], stack.shape)
+    columns[:, 3] *= config.octave_layers / 255
+    return columns
+
+
+def _once(columns: Float64[np.ndarray, "N 4"], shape: tuple[int, ...]) -> Float64[np.ndarray, "M 4"]:
+    """Several starts can end at one extremum; nearest pixel and layer say which."""
+    x, y, layer = np.rint(columns[:, :3]).astype(np.int64).T
+    _, first = np.unique((layer * shape[1] + y) * shape[2] + x, return_index=True)
+    return columns[np.sort(first)]
 
 
 def _oriented(stacks: list[np.ndarray], extrema: _Extrema, layers: int) -> tuple[np.ndarray, FloatArray]:

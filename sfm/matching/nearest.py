@@ -61,9 +61,9 @@ class MatchingConfig:
     """Binary features an image above which only those that share a hash are compared (see `binary`)."""
 
     guided: bool = False
-    """Matches once more along the epipolar lines of a verified pair, and verifies again: more matches of repeated things
-    (1,215 instead of 609 on a pair of Herz-Jesus-P8, 377 instead of 298 on one of lund; a quarter of a second a pair
-    of 8,000 features). Users of COLMAP report that global mapping gets worse by it."""
+    """Matches once more along the epipolar lines of a verified pair, and verifies again: more matches of repeated
+    things (1,215 instead of 609 on a pair of Herz-Jesus-P8, 377 instead of 298 on one of lund; a quarter of a second a
+    pair of 8,000 features). Users of COLMAP report that global mapping gets worse by it."""
 
     guided_error_px: float = 4.0
     """Largest distance from the epipolar line in px, for `guided`."""

@@ -182,17 +182,18 @@ def _advice(inspection: Inspection) -> list[str]:
     spare = sum(len(group) - 1 for group in inspection.copies)
     near = sum(len(group) - 1 for group in inspection.near_copies)
     one_camera = "; if one camera took all of them, say --single-camera" if len(sizes) == 1 else ""
-    return [
-        "three photos are the least for a model that can be checked, some dozens are good" if len(images) < 3 else "",
-        blurred and f"{len(blurred)} blurred ({_named(blurred)}): leave them out where others show the same",
-        blank and f"{len(blank)} with hardly any detail ({_named(blank)}): nothing can be matched there",
-        poor and f"exposure: {poor}: detail that is lost cannot be matched",
-        spare and f"{spare} exact copies: they cost time and bring nothing",
-        near and f"{near} near copies (other size or compression, or taken from the same place): keep the best",
-        f"{len(sizes)} sizes of photos: a camera is estimated for each" if len(sizes) > 1 else "",
-        f"no focal length in EXIF for {without} of {len(images)}: it is estimated{one_camera}" if without else "",
-        f"{len(inspection.unreadable)} files cannot be used" if inspection.unreadable else "",
-    ]  # type: ignore[return-value]
+    advice = (
+        (len(images) < 3, "three photos are the least for a model that can be checked, some dozens are good"),
+        (blurred, f"{len(blurred)} blurred ({_named(blurred)}): leave them out where others show the same"),
+        (blank, f"{len(blank)} with hardly any detail ({_named(blank)}): nothing can be matched there"),
+        (poor, f"exposure: {poor}: detail that is lost cannot be matched"),
+        (spare, f"{spare} exact copies: they cost time and bring nothing"),
+        (near, f"{near} near copies (other size or compression, or taken from the same place): keep the best"),
+        (len(sizes) > 1, f"{len(sizes)} sizes of photos: a camera is estimated for each"),
+        (without, f"no focal length in EXIF for {without} of {len(images)}: it is estimated{one_camera}"),
+        (inspection.unreadable, f"{len(inspection.unreadable)} files cannot be used"),
+    )
+    return [text for applies, text in advice if applies]
 
 
 def _image_json(inspection: Inspection, image: InspectedImage) -> dict[str, Any]:

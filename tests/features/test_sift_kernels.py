@@ -207,7 +207,7 @@ def test_a_shifted_scene_gives_shifted_keypoints_without_bias(options, shift):
 
 def test_a_flat_image_gets_a_lower_threshold():
     flat = (100 + 0.1 * noise(5, 300, 400)).astype(np.uint8)
-    few = extract_features(flat, FeatureConfig(enough_features=0))
+    few = extract_features(flat, FeatureConfig(min_features=0))
     more = extract_features(flat, FeatureConfig())
     assert isinstance(more, Features)
     assert len(more) > 2 * (len(few) if isinstance(few, Features) else 0) + 50
