@@ -38,6 +38,7 @@ from sfm.core.robust.fundamental import MatrixEstimate
 from sfm.core.robust.ransac import RansacConfig, polish
 from sfm.core.robust.relative_pose import (
     essential_problem,
+    flat,
     relative_pose_of_bearings,
     scatter,
 )
@@ -264,13 +265,12 @@ def _planar_pose(
     problem, usable = essential_problem(pair.bearings1, pair.bearings2, config.ransac.max_error_px)
     best, best_key = None, (-1.0, 0.0)
     for candidate in candidates:
-        t = candidate.translation / np.linalg.norm(candidate.translation)
-        state = polish(problem, np.concatenate([candidate.rotation.matrix.ravel(), t]))
-        squares = problem.squared_errors(problem.model(state))
+        start = flat(essential_from_pose(candidate) / np.linalg.norm(candidate.translation))
+        model, squares = polish(problem, start)
         kept = scatter(squares < problem.max_error**2, usable)
         if not kept.any():
             continue
-        essential = problem.model(state).reshape(3, 3)
+        essential = model[:9].reshape(3, 3)
         refined, front = pose_from_essential(essential, pair.bearings1.rays[kept], pair.bearings2.rays[kept])
         key = (float(front.sum()), -float(np.minimum(squares, problem.max_error**2).sum()))
         if key > best_key:
