@@ -63,11 +63,12 @@ def count_votes(image, words, signatures, turns, starts, images, posted, posted_
         if end - first > longest:
             continue
         for p in range(first, end):
-            x = signatures[k] ^ posted[p]
+            x = signatures[k] ^ posted[p]  # its bits are counted in the way that compilers know as popcount
             x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
             x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
             x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-            if (x * np.uint64(0x0101010101010101)) >> np.uint64(56) <= max_hamming and last[images[p]] != k:
+            bits = np.multiply(x, np.uint64(0x0101010101010101)) >> np.uint64(56)  # as a ufunc it overflows silently
+            if np.int64(bits) <= max_hamming and last[images[p]] != k:
                 last[images[p]] = k
                 by_turn[images[p], (np.int64(turns[k]) - np.int64(posted_turns[p])) & 15] += 1
     for i in range(len(votes)):

@@ -15,7 +15,7 @@ from sfm.core.events import ImageCompared, Note, StageFinished, StageStarted
 from sfm.io.database import Database
 from sfm.pipeline import pair_scores
 from sfm.pipeline.config import PipelineConfig
-from sfm.retrieval import RetrievalConfig, probe_scores
+from sfm.retrieval import RetrievalConfig, choice, probe_scores
 from tests.pictures import texture
 from tests.pipeline.conftest import write_photo
 from tests.pipeline.test_run import Told, run
@@ -182,6 +182,20 @@ def test_photos_are_compared_with_those_taken_near_by_and_those_without_a_place_
     assert by_place <= matched
     assert all("b2" in pair for pair in matched - by_place)
     assert {("b1", "b2"), ("b2", "b3")} <= matched
+
+
+@pytest.mark.parametrize(("prefixes", "method"), [(["frame"], "sequential"), (["one", "other"], "vocabulary")])
+def test_the_run_chooses_by_itself_and_says_why(tmp_path, monkeypatch, prefixes, method):
+    monkeypatch.setattr(choice, "_MANY", 8)
+    picture = texture(1, (120, 400))
+    for k in range(12):
+        write_photo(tmp_path / "photos" / f"{prefixes[k % len(prefixes)]}{k}.png", picture[:, 8 * k : 8 * k + 160])
+    config = PipelineConfig(retrieval=dataclasses.replace(FEW, overlap=2, loop_partners=0))
+    told = run(tmp_path / "photos", tmp_path / "ws", config)
+    (said,) = [e.message for e in told.events if isinstance(e, Note) and "are compared" in e.message]
+    assert f"({method}: " in said
+    matched, _ = _pairs(tmp_path / "ws")
+    assert (len(matched) == 11 + 10 + 8) is (method == "sequential")
 
 
 def test_without_any_place_the_spatial_method_says_so(tmp_path):
