@@ -11,6 +11,8 @@ SMALLEST_SIDE_PX = 16
 """Below this there is no second octave, and hardly a keypoint."""
 
 FeatureKind: TypeAlias = Literal["sift", "orb", "akaze", "brisk", "harris", "shi_tomasi", "fast", "aliked", "disk"]
+NETWORKS: tuple[FeatureKind, ...] = ("aliked", "disk")
+"""Those that need an ONNX file."""
 CornerDescriptor: TypeAlias = Literal["brief", "freak"]
 Spreading: TypeAlias = Literal["strongest", "even"]
 

@@ -2,6 +2,7 @@
 
 from sfm.matching.cells import SearchableFeatures
 from sfm.matching.guided import match_guided
+from sfm.matching.lightglue import LightGlue
 from sfm.matching.nearest import MatchingConfig, match_features
 
-__all__ = ["MatchingConfig", "SearchableFeatures", "match_features", "match_guided"]
+__all__ = ["LightGlue", "MatchingConfig", "SearchableFeatures", "match_features", "match_guided"]

@@ -56,7 +56,7 @@ class SearchableFeatures:
     """The descriptors of an image with what searches need, which is computed once for all of its pairs."""
 
     def __init__(self, features: Features) -> None:
-        self.descriptors, self.kind = features.descriptors, features.kind
+        self.features, self.descriptors, self.kind = features, features.descriptors, features.kind
         self._cells: Cells | None = None
         self._words: np.ndarray | None = None
 

@@ -60,10 +60,16 @@ class MatchingConfig:
     hashed_above: int = 50000
     """Binary features an image above which only those that share a hash are compared (see `binary`)."""
 
+    lightglue: str = ""
+    """ONNX file of LightGlue, for features of the network that it was trained with; empty for nearest neighbours."""
+
+    min_score: float = 0.1
+    """Least score of a match by LightGlue; its authors' value."""
+
     guided: bool = False
-    """Matches once more along the epipolar lines of a verified pair, and verifies again: more matches of repeated
-    things (1,215 instead of 609 on a pair of Herz-Jesus-P8, 377 instead of 298 on one of lund; a quarter of a second a
-    pair of 8,000 features). Users of COLMAP report that global mapping gets worse by it."""
+    """Matches once more along the epipolar lines of a verified pair, and verifies again: more matches of what repeats
+    (1,215 instead of 609 on a pair of Herz-Jesus-P8, 377 instead of 298 on one of lund; a quarter of a second a pair
+    of 8,000 features). Users of COLMAP report that global mapping gets worse by it."""
 
     guided_error_px: float = 4.0
     """Largest distance from the epipolar line in px, for `guided`."""

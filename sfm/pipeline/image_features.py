@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, ImageError, Rejected
 from sfm.core.scene import Features
-from sfm.features import FeatureConfig, descriptor_kind, extract
+from sfm.features import NETWORKS, FeatureConfig, descriptor_kind, extract
 from sfm.io.database import Decision
 from sfm.io.images import read_image
 from sfm.io.masks import masked_share, read_mask
@@ -91,7 +91,7 @@ def model_digest(config: FeatureConfig) -> str:
     Raises:
         ConfigError: there is no such file.
     """
-    if config.kind not in ("aliked", "disk"):
+    if config.kind not in NETWORKS:
         return ""
     if not config.model:
         raise ConfigError(f"{config.kind} needs the file of its network", remedy="--set features.model=FILE.onnx")

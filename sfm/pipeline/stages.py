@@ -15,13 +15,13 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import FeaturesExtracted, Observer, PairMatched, PairVerified, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
 from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
-from sfm.features import working_memory_bytes
+from sfm.features import NETWORKS, working_memory_bytes
 from sfm.io.database import Database
-from sfm.matching import SearchableFeatures, match_features, match_guided
+from sfm.matching import LightGlue, SearchableFeatures, match_features, match_guided
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.image_features import STAGE as FEATURES
 from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, model_digest
@@ -94,9 +94,17 @@ def extract_all(run: Run) -> dict[int, str]:
 
 
 def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) -> dict[Pair, str]:
-    """Putative matches of pairs i < j of images that have features; returns the key of each pair."""
+    """Putative matches of pairs i < j of images that have features; returns the key of each pair.
+
+    Raises:
+        ConfigError: the file of LightGlue cannot be used, or the features are not those of a network.
+    """
     stage, config = "matching", run.config.matching
-    basis = key_of(code_digest("sfm.matching", "sfm.core"), config)
+    network = LightGlue(config.lightglue) if config.lightglue else None
+    if network and run.config.features.kind not in NETWORKS:
+        cause = f"matching.lightglue needs features of a network, not {run.config.features.kind}"
+        raise ConfigError(cause, remedy="choose features.kind aliked or disk, or no matching.lightglue")
+    basis = key_of(code_digest("sfm.matching", "sfm.core"), config, *([network.digest] if network else []))
     keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}
     stale = _stale(run, stage, keys, present=run.database.matched_pairs())
     features = lru_cache(_CACHED_IMAGES)(lambda image_id: SearchableFeatures(run.database.read_features(image_id)))
@@ -107,7 +115,10 @@ def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) 
 
     def compute(item: tuple[Pair, SearchableFeatures, SearchableFeatures]) -> tuple[Pair, Matches]:
         pair, features1, features2 = item
-        return pair, match_features(features1, features2, config)
+        if network is None:
+            return pair, match_features(features1, features2, config)
+        size1, size2 = ((run.images[k].camera.width, run.images[k].camera.height) for k in pair)
+        return pair, network.match(features1.features, features2.features, size1, size2, config.min_score)
 
     def write(result: tuple[Pair, Matches]) -> None:
         pair, matches = result

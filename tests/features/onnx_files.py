@@ -14,21 +14,30 @@ _FLOAT = 1
 _OPSET, _IR = 13, 8
 
 
-def constant_network(outputs: Mapping[str, np.ndarray], image: str = "image") -> bytes:
-    """A network with one input (1, 3, H, W) whose outputs are constants, each by a node `Constant`.
+def constant_network(outputs: Mapping[str, np.ndarray], inputs: Mapping[str, int] | None = None) -> bytes:
+    """A network whose outputs are constants, each by a node `Constant`.
 
-    The input takes part by a sum that is multiplied by zero and added to the first output: an input that nothing
-    needs would be left out.
+    The inputs take part by their means, which are multiplied by zero and added to the outputs: what nothing needs
+    would be left out.
+
+    Args:
+        inputs: number of axes by name; the first axis has length 1. Without it one `image` (1, 3, H, W).
     """
-    names = list(outputs)
-    zero = _node("ReduceMean", [image], ["mean"], [_integers("axes", [1, 2, 3]), _integer("keepdims", 0)])
-    nodes = [zero, _constant("nought", np.zeros((), np.float32)), _node("Mul", ["mean", "nought"], ["nothing"], [])]
+    axes = inputs or {"image": 4}
+    nodes, nothing = [_constant("nought", np.zeros((1,), np.float32))], "nought"
+    for name, count in axes.items():
+        reduced = [_integers("axes", list(range(1, count))), _integer("keepdims", 0)]
+        nodes.append(_node("ReduceMean", [name], [f"{name}_mean"], reduced))
+        nodes.append(_node("Mul", [f"{name}_mean", nothing], [f"{name}_nothing"], []))
+        nothing = f"{name}_nothing"
     for name, values in outputs.items():
         nodes.append(_constant(f"{name}_values", values))
-        nodes.append(_node("Add", [f"{name}_values", "nothing"], [name], []))
+        nodes.append(_node("Add", [f"{name}_values", nothing], [name], []))
     graph = b"".join(_field(1, node) for node in nodes) + _field(2, b"tiny")
-    graph += _field(11, _value_info(image, [1, 3, "H", "W"]))
-    graph += b"".join(_field(12, _value_info(name, list(outputs[name].shape))) for name in names)
+    for name, count in axes.items():
+        free: list[int | str] = [1, 3, "H", "W"] if count == 4 else [1, *(f"{name}_{k}" for k in range(1, count))]
+        graph += _field(11, _value_info(name, free))
+    graph += b"".join(_field(12, _value_info(name, list(outputs[name].shape))) for name in outputs)
     return _number(1, _IR) + _field(7, graph) + _field(8, _field(1, b"") + _number(2, _OPSET))
 
 

@@ -17,6 +17,7 @@ from sfm.pipeline import stages
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.run import reconstruct
 from sfm.prepare import PrepareConfig
+from tests.features.onnx_files import constant_network
 from tests.pipeline.conftest import write_photo
 
 LEFT_HIDDEN = np.repeat(np.where(np.arange(160) < 60, 0, 255)[None], 120, axis=0).astype(np.uint8)
@@ -129,10 +130,34 @@ def test_guided_matching_adds_what_agrees_with_a_verified_pair(photos, tmp_path,
         return dataclasses.replace(geometry, F=shift) if geometry else geometry
 
     monkeypatch.setattr(stages, "verify_pair", along_rows)
-    strict = MatchingConfig(max_ratio=0.4)
+    strict = MatchingConfig(max_ratio=0.3)
 
     def inliers(name: str, matching: MatchingConfig) -> int:
         with run(photos, tmp_path / name, PipelineConfig(matching=matching))[0] as database:
             return sum(len(geometry) for geometry in database.read_view_graph().pairs.values())
 
     assert inliers("guided", dataclasses.replace(strict, guided=True)) > inliers("plain", strict)
+
+
+def test_features_and_matches_of_networks_go_through_the_pipeline(photos, tmp_path):
+    """Networks that answer the same whatever they see: features on a grid, each matched with its like."""
+    x, y = np.meshgrid(np.arange(10, 150, 8), np.arange(10, 110, 8))
+    points = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float32)
+    count = len(points)
+    descriptors = np.random.default_rng(0).normal(size=(count, 64)).astype(np.float32)
+    answers = {"keypoints": points, "scores": np.ones(count, np.float32), "descriptors": descriptors}
+    (tmp_path / "aliked.onnx").write_bytes(constant_network(answers))
+    pairs = np.stack([np.arange(count, dtype=np.float32)] * 2, axis=1)[::2]
+    inputs = {"kpts0": 3, "kpts1": 3, "desc0": 3, "desc1": 3}
+    answers = {"matches0": pairs, "mscores0": np.ones(len(pairs), np.float32)}
+    (tmp_path / "lightglue.onnx").write_bytes(constant_network(answers, inputs))
+    features = FeatureConfig(kind="aliked", model=str(tmp_path / "aliked.onnx"))
+    for matching, expected in ((MatchingConfig(), count), (with_lightglue(tmp_path), len(pairs))):
+        with run(photos, tmp_path / "ws", PipelineConfig(features=features, matching=matching))[0] as database:
+            assert set(database.match_counts().values()) == {expected}
+    with pytest.raises(ConfigError, match="needs features of a network"):
+        run(photos, tmp_path / "ws", PipelineConfig(matching=with_lightglue(tmp_path)))
+
+
+def with_lightglue(folder: Path) -> MatchingConfig:
+    return MatchingConfig(lightglue=str(folder / "lightglue.onnx"))
