@@ -103,8 +103,9 @@ def _followed(
 
     def follow(first: np.ndarray, second: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         window = (config.window_px, config.window_px)
+        start = places[:, None].copy()
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            first, second, places[:, None], None, winSize=window, maxLevel=config.levels - 1, criteria=_CRITERIA
+            first, second, places[:, None], start, winSize=window, maxLevel=config.levels - 1, criteria=_CRITERIA
         )
         return moved.reshape(-1, 2), status.reshape(-1) > 0
 
@@ -131,7 +132,7 @@ def _new_corners(
     if found is None:
         return np.zeros((0, 2), np.float32)
     corners = cv2.cornerSubPix(grey, found.reshape(-1, 1, 2), (3, 3), (-1, -1), _CRITERIA).reshape(-1, 2)
-    corners = np.clip(corners, 0, np.float32([grey.shape[1] - 1, grey.shape[0] - 1]))
+    corners = np.clip(corners, 0, np.array([grey.shape[1] - 1, grey.shape[0] - 1], np.float32))
     return corners[_allowed(mask, corners)]
 
 
