@@ -13,6 +13,11 @@ from sfm.core.errors import ExitCode, SfmError
 
 COMMANDS = {
     "run": "photos → camera poses and a sparse model",
+    "features": "the first stage alone: keypoints of all photos",
+    "pairs": "the next: which pairs of photos are to be matched",
+    "match": "the next: matches of these pairs",
+    "verify": "the next: which matches a rigid scene explains, and how",
+    "inspect": "photos: sharpness, exposure, EXIF, copies, what cannot be read",
     "view": "look at a workspace in the Rerun viewer",
     "compare": "pose errors of a model against a reference",
     "convert": "a model from one format to another: COLMAP binary, text, PLY",

@@ -26,20 +26,8 @@ def _arg(metavar: str, default: str = "", **options: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunOptions:
-    """Camera poses and a sparse model from a folder of photos.
-
-    A run that was interrupted goes on where it stopped when it is repeated; new photos in the folder are added. What
-    is not given here is as in the workspace's sfm.toml, or else a default.
-    """
-
-    images: Annotated[tyro.conf.Positional[Path], _arg("IMAGES")]
-    """Folder of photos; folders within are searched as well. It is only read."""
-
-    output: Annotated[
-        Path | None, tyro.conf.arg(aliases=["-o"], metavar="WORKSPACE", help_behavior_hint="(default: IMAGES-sfm)")
-    ] = None
-    """Workspace for all results. Without it a folder beside the photos."""
+class SettingOptions:
+    """The settings that have an option of their own, the same for all commands that compute in a workspace."""
 
     max_image_size: Annotated[int | None, _arg("PX", "1600")] = None
     """Longest side to which larger photos are reduced when features are sought; 0 for full size."""
@@ -70,6 +58,12 @@ class RunOptions:
     camera_per_image: Flag = False
     """Every photo has its own camera."""
 
+    pairs: Annotated[str | None, _arg("METHOD", "auto")] = None
+    """Which photos are compared: exhaustive, vocabulary, look, sequential (frames of a video), spatial (by GPS)."""
+
+    pair_list: Annotated[Path | None, _arg("FILE")] = None
+    """Compare the pairs of this file only: two names of photos a line."""
+
     seed: Annotated[int | None, _arg("N", "0")] = None
     """Of all random choices; the same seed gives the same result."""
 
@@ -80,17 +74,34 @@ class RunOptions:
     """Any other setting, by its key in sfm.toml; may be repeated."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunOptions(SettingOptions):
+    """Camera poses and a sparse model from a folder of photos.
+
+    A run that was interrupted goes on where it stopped when it is repeated; new photos in the folder are added. What
+    is not given here is as in the workspace's sfm.toml, or else a default.
+    """
+
+    images: Annotated[tyro.conf.Positional[Path], _arg("IMAGES")]
+    """Folder of photos; folders within are searched as well. It is only read."""
+
+    output: Annotated[
+        Path | None, tyro.conf.arg(aliases=["-o"], metavar="WORKSPACE", help_behavior_hint="(default: IMAGES-sfm)")
+    ] = None
+    """Workspace for all results. Without it a folder beside the photos."""
+
+
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(RunOptions, "run", words, EXAMPLES)
-    _check(options)
+    check(options)
 
     from sfm.pipeline.observers import screen_progress, watched
     from sfm.pipeline.run import reconstruct
 
     workspace = options.output or default_workspace(options.images)
     with watched(screen_progress()) as observer:
-        config, note = _config(options, workspace)
+        config, note = configured(options, workspace)
         if note:
             observer(Note(message=note))
         report = reconstruct(options.images, workspace, config, threads=options.threads, observer=observer)
@@ -104,15 +115,18 @@ def default_workspace(images: Path) -> Path:
     return folder.with_name(f"{folder.name or 'photos'}-sfm")
 
 
-def _check(options: RunOptions) -> None:
+def check(options: SettingOptions) -> None:
+    """Raises ConfigError where options exclude each other or are out of range."""
     sharing = [options.single_camera, options.camera_per_folder, options.camera_per_image]
     if sum(sharing) > 1:
         raise ConfigError("--single-camera, --camera-per-folder and --camera-per-image exclude each other")
+    if options.pair_list is not None and options.pairs not in (None, "list"):
+        raise ConfigError("--pairs and --pair-list exclude each other")
     if options.threads < 0:
         raise ConfigError(f"--threads must not be negative, got {options.threads}")
 
 
-def _config(options: RunOptions, workspace: Path) -> tuple[Any, str]:
+def configured(options: SettingOptions, workspace: Path) -> tuple[Any, str]:
     """All settings: defaults, then the workspace's sfm.toml, then the command line; and what the file changed."""
     from sfm.pipeline.config import PipelineConfig, flattened, parsed_setting, read_toml, with_settings
 
@@ -129,7 +143,7 @@ def _config(options: RunOptions, workspace: Path) -> tuple[Any, str]:
     return with_settings(config, given, "command line"), note
 
 
-def _shortcuts(options: RunOptions) -> Iterator[tuple[str, Any]]:
+def _shortcuts(options: SettingOptions) -> Iterator[tuple[str, Any]]:
     """The settings that have an option of their own."""
     if options.max_image_size is not None:
         yield "features.max_image_size", options.max_image_size
@@ -150,5 +164,10 @@ def _shortcuts(options: RunOptions) -> Iterator[tuple[str, Any]]:
     ):
         if wanted:
             yield "cameras.sharing", sharing
+    if options.pairs is not None:
+        yield "retrieval.method", options.pairs.lower()
+    if options.pair_list is not None:
+        yield "retrieval.method", "list"
+        yield "retrieval.pair_list", str(options.pair_list.absolute())
     if options.seed is not None:
         yield "seed", options.seed

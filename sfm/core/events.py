@@ -56,6 +56,13 @@ class FeaturesExtracted(Event):
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class ImageCompared(Event):
+    """What one image has in common with the others is known; this decides which pairs are matched."""
+
+    name: str
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class PairMatched(Event):
     """Putative matches of one pair are known."""
 

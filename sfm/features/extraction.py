@@ -29,6 +29,8 @@ from sfm.features.sift import detect_sift, sift_memory_bytes
 _LOWERED_AT_MOST = 3
 """Times that the contrast is halved for an image with few features; below an eighth there is only noise."""
 
+_ALL = 1_000_000
+
 Preparation: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """What is done to the reduced grey image before features are sought."""
 
@@ -111,8 +113,10 @@ def detect(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: Select
         return _detect(grey, config, select)
     distance = _hamming if descriptor_kind(config) == DescriptorKind.BINARY else _euclidean
 
+    uncut = dataclasses.replace(config, max_features=_ALL)  # the best are chosen from all views together
+
     def detect_plainly(view: np.ndarray, select_there: Selection) -> Described:
-        return _detect(view, config, select_there)
+        return _detect(view, uncut, select_there)
 
     keypoints, descriptors = detect_in_views(grey, config.affine_tilts, detect_plainly, select, distance)
     if config.upright:

@@ -50,8 +50,12 @@ def in_reading_order(keypoints: Keypoints) -> Indices:
 
 def strongest(keypoints: Keypoints, limit: int) -> Indices:
     """Rows of the `limit` strongest, ascending; of equals, those that come first in reading order."""
-    order = in_reading_order(keypoints)
-    return np.sort(order[np.argsort(-keypoints.responses[order], kind="stable")[:limit]])
+    if len(keypoints) <= limit:
+        return np.arange(len(keypoints))
+    weakest = np.partition(keypoints.responses, -limit)[-limit]
+    rows, equals = np.flatnonzero(keypoints.responses > weakest), np.flatnonzero(keypoints.responses == weakest)
+    first = equals[in_reading_order(keypoints[equals])[: limit - len(rows)]]
+    return np.sort(np.concatenate([rows, first]))
 
 
 def joined(parts: Sequence[Keypoints]) -> Keypoints:

@@ -103,9 +103,9 @@ def _followed(
 
     def follow(first: np.ndarray, second: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         window = (config.window_px, config.window_px)
-        given = np.ascontiguousarray(places[:, None])
+        start = places[:, None].copy()
         moved, status, _ = cv2.calcOpticalFlowPyrLK(
-            first, second, given, np.empty_like(given), winSize=window, maxLevel=config.levels - 1, criteria=_CRITERIA
+            first, second, places[:, None], start, winSize=window, maxLevel=config.levels - 1, criteria=_CRITERIA
         )
         return moved.reshape(-1, 2), status.reshape(-1) > 0
 

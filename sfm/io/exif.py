@@ -75,7 +75,8 @@ def read_image_info(path: Path | str) -> ImageInfo:
             # Pillow warns of every oddity in EXIF and of large images; neither is of use to anyone here.
             warnings.simplefilter("ignore")
             with Image.open(path) as image:
-                info = _info(*image.size, *_tags(image))
+                tags = ({}, {}, {}) if image.format == "PNG" and _lacks_exif(path) else _tags(image)
+                info = _info(*image.size, *tags)
                 # Pillow and OpenCV turn the pixels of a TIFF themselves, whatever they are told.
                 return dataclasses.replace(info, orientation=1) if image.format == "TIFF" else info
     except (Image.UnidentifiedImageError, Image.DecompressionBombError):
@@ -114,6 +115,12 @@ def _from_sensor_resolution(info: ImageInfo) -> float | None:
 
 
 # Tags
+
+
+def _lacks_exif(path: Path) -> bool:
+    """Whether a PNG has none of the chunks that hold EXIF. They may follow the pixels, which Pillow decodes first."""
+    data = path.read_bytes()
+    return b"eXIf" not in data and b"Raw profile type" not in data
 
 
 def _tags(image: Image.Image) -> tuple[dict[int, Any], dict[int, Any], dict[int, Any]]:

@@ -85,21 +85,29 @@ def gather(source, rows, out):
 @njit(cache=True, nogil=True)
 def scan_cell(dots, rows, first_column, squared1, squared2, best1, second1, index1, best2, second2, index2):
     """As `scan_block`, for some rows of image 1 and the columns `first_column…` of image 2."""
+    columns = dots.shape[1]
+    # Slices: with an offset in the index, which might be negative, the loop would not become vector instructions.
+    near, next_, index_of = (
+        best2[first_column : first_column + columns],
+        second2[first_column : first_column + columns],
+        index2[first_column : first_column + columns],
+    )
+    squared = squared2[first_column : first_column + columns]
     for r in range(len(rows)):
         i = rows[r]
-        offset = squared1[i]
+        offset, line = squared1[i], dots[r]
+        for c in range(columns):
+            distance = offset + squared[c] - np.float32(2) * line[c]
+            line[c] = distance
+            index_of[c] = i if distance < near[c] else index_of[c]
+            next_[c] = min(next_[c], max(distance, near[c]))
+            near[c] = min(near[c], distance)
         best, second, index = best1[i], second1[i], index1[i]
-        for c in range(dots.shape[1]):
-            j = first_column + c
-            distance = offset + squared2[j] - np.float32(2) * dots[r, c]
+        for c in range(columns):
+            distance = line[c]
             if distance < second:
                 if distance < best:
-                    second, best, index = best, distance, np.int32(j)
+                    second, best, index = best, distance, np.int32(first_column + c)
                 else:
                     second = distance
-            if distance < second2[j]:
-                if distance < best2[j]:
-                    second2[j], best2[j], index2[j] = best2[j], distance, np.int32(i)
-                else:
-                    second2[j] = distance
         best1[i], second1[i], index1[i] = best, second, index

@@ -23,6 +23,7 @@ from sfm.matching import MatchingConfig
 from sfm.prepare import PrepareConfig
 from sfm.retrieval import RetrievalConfig
 from sfm.verification import VerificationConfig
+from sfm.viewgraph import CycleConfig
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,7 @@ class PipelineConfig:
     retrieval: RetrievalConfig = dataclasses.field(default_factory=RetrievalConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
     verification: VerificationConfig = dataclasses.field(default_factory=VerificationConfig)
+    cycles: CycleConfig = dataclasses.field(default_factory=CycleConfig)
     mapping: MappingConfig = dataclasses.field(default_factory=MappingConfig)
     masks: str = ""
     """Folder of masks, black where nothing shall be sought (see `sfm.io.masks`); empty for a folder called masks in

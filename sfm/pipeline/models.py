@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sfm.core.events import Event, ImageRegistered, StageFinished, StageStarted
-from sfm.core.scene import Reconstruction
+from sfm.core.scene import Reconstruction, ViewGraph
 from sfm.io.atomic import replace_folders
 from sfm.io.colmap_model import model_format, read_model, write_model
 from sfm.io.database import Decision
@@ -16,7 +16,7 @@ from sfm.mapping import map_incrementally
 from sfm.pipeline.colors import colorize
 from sfm.pipeline.keys import code_digest, file_digest, key_of
 from sfm.pipeline.stages import Pair, Run
-from sfm.viewgraph import calibrate_focal_lengths, poses_under
+from sfm.viewgraph import calibrate_focal_lengths, cycle_consistency, poses_under, without_contradictions
 
 STAGE = "mapping"
 
@@ -58,14 +58,16 @@ def _map(run: Run) -> list[Reconstruction]:
     keypoints = {image_id: database.read_keypoints(image_id) for image_id in used}
     image_cameras = {image_id: image.camera_id for image_id, image in used.items()}
     guessed = {image.camera_id: image.camera for image in used.values()}
-    cameras = calibrate_focal_lengths(graph, guessed, image_cameras)
+    cameras = calibrate_focal_lengths(graph, guessed, image_cameras, doubt_known=not config.cameras.intrinsics)
     decisions += [
         Decision(STAGE, image.name, "focal_px", cameras[k].mean_focal_length, guessed[k].mean_focal_length, "estimated")
         for image in used.values()
         if cameras[k := image.camera_id] is not guessed[k]
     ]
+    graph, contradicting = _consistent(run, poses_under(graph, keypoints, cameras, image_cameras))
+    decisions += contradicting
     models = map_incrementally(
-        poses_under(graph, keypoints, cameras, image_cameras),
+        graph,
         keypoints,
         cameras,
         image_cameras,
@@ -83,6 +85,22 @@ def _map(run: Run) -> list[Reconstruction]:
     return models
 
 
+def _consistent(run: Run, graph: ViewGraph) -> tuple[ViewGraph, list[Decision]]:
+    """The view graph without the pairs that contradict the others, and what is noted of these."""
+    config = run.config.cycles
+    found = cycle_consistency(graph, config)
+    decisions = [
+        Decision(
+            *(STAGE, "\t".join(run.pair_names(pair)), "cycle_consistency", one.consistency, config.min_consistency),
+            "dropped" if config.drop else "contradicts",
+            f"rotation against that of {one.evidence:.1f} triplets, {len(graph.pairs[pair])} matches",
+        )
+        for pair, one in found.items()
+        if one.contradicts
+    ]
+    return without_contradictions(graph, found) if config.drop else graph, decisions
+
+
 def refines_intrinsics(run: Run) -> bool:
     """Given intrinsics are held fixed unless the user says otherwise."""
     cameras = run.config.cameras
@@ -93,7 +111,7 @@ def _key(run: Run, pair_keys: Mapping[Pair, str]) -> str:
     code = code_digest("sfm.viewgraph", "sfm.mapping", "sfm.bundle", "sfm.core", "sfm.pipeline", "sfm.io")
     images = [[k, image.name, image.digest, image.camera_id, image.camera] for k, image in sorted(run.images.items())]
     pairs = [[*pair, key] for pair, key in sorted(pair_keys.items())]
-    return key_of(code, run.config.mapping, run.config.seed, refines_intrinsics(run), images, pairs)
+    return key_of(code, run.config.cycles, run.config.mapping, run.config.seed, refines_intrinsics(run), images, pairs)
 
 
 def _model_folders(folder: Path) -> list[Path]:

@@ -20,6 +20,7 @@ from typing import Protocol, runtime_checkable
 from sfm.core.events import (
     Event,
     FeaturesExtracted,
+    ImageCompared,
     ImageRead,
     ImageRegistered,
     Note,
@@ -34,7 +35,7 @@ _LINE_EVERY_S = 5.0
 _LINE_EVERY_SHARE = 0.1
 _LINE_GAP_S = 1.0
 """Between lines at least, however fast the shares pass."""
-_ITEMS = (ImageRead, FeaturesExtracted, PairMatched, PairVerified)
+_ITEMS = (ImageRead, FeaturesExtracted, ImageCompared, PairMatched, PairVerified)
 
 
 @runtime_checkable

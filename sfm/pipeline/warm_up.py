@@ -27,11 +27,12 @@ from sfm.core.events import Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import Features, Matches, PairKind, Reconstruction, TwoViewGeometry, ViewGraph
+from sfm.features import extract_features
 from sfm.io.colmap_model import write_model
 from sfm.io.kernel_cache import is_complete, mark_complete
 from sfm.mapping import map_incrementally
 from sfm.matching import MatchingConfig, match_features
-from sfm.retrieval import pair_scores
+from sfm.retrieval import RetrievalConfig, similar_images
 from sfm.verification import verify_pair
 
 _IMAGES, _POINTS, _STRAYS = 6, 240, 24
@@ -99,6 +100,12 @@ def run_parts(names: Sequence[str]) -> None:
         _PARTS[name]()
 
 
+def _features() -> None:
+    """Features of a small image of squares."""
+    squares = np.random.default_rng(0).integers(0, 255, (8, 8), dtype=np.uint8)
+    extract_features(np.kron(squares, np.ones((8, 8), np.uint8)))
+
+
 def _pair() -> None:
     """Matching and verification of two images, with known and with unknown focal lengths."""
     descriptors = np.random.default_rng(0).integers(0, 90, (8, 128), dtype=np.uint8)
@@ -106,7 +113,7 @@ def _pair() -> None:
     features = Features(np.zeros((8, 2)), zeros, zeros, descriptors)
     for exact_below in (3000, 0):
         match_features(features, features, MatchingConfig(exact_below=exact_below))
-    pair_scores([descriptors.astype(np.float32)] * 2)
+    similar_images(lambda image: features, 2, RetrievalConfig())
     for calibrated in (True, False):
         _verified(calibrated)
 
@@ -135,7 +142,7 @@ def _models() -> list[Reconstruction]:
     return models
 
 
-_PARTS = {"pair": _pair, "models": _models}
+_PARTS = {"pair": _pair, "models": _models, "features": _features}
 
 
 def _camera(calibrated: bool) -> Camera:

@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 
-from sfm.core.arrays import Mask, Points2D
+from sfm.core.arrays import Mask, Matrix3, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
+from sfm.core.geometry.homography import transfer_errors
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.robust.fundamental import MatrixEstimate, estimate_fundamental, estimate_homography
 from sfm.core.robust.ransac import RansacConfig, required_iterations
@@ -21,6 +22,7 @@ class MatchedPair:
 
     Attributes:
         perspective: both cameras have pixels of an undistorted pinhole camera, so that F and H make sense.
+        guessed: for each camera, whether its focal length is only a guess.
         calibrated: the rays of both cameras are to be trusted.
     """
 
@@ -39,9 +41,10 @@ class MatchedPair:
         self.ransac, self.rng = ransac, rng
         self.bearings1, self.bearings2 = Bearings.of(points1, camera1), Bearings.of(points2, camera2)
         self.count = len(points1)
+        prior1, prior2 = camera1.has_prior_focal_length, camera2.has_prior_focal_length
+        self.guessed = not (trust_focal or prior1), not (trust_focal or prior2)
         self.perspective = not (camera1.model_info.is_fisheye or camera2.model_info.is_fisheye)
-        known = camera1.has_prior_focal_length and camera2.has_prior_focal_length
-        self.calibrated = known or trust_focal or not self.perspective
+        self.calibrated = not any(self.guessed) or not self.perspective
 
     def limited(self, sample_size: int, relevant: float) -> RansacConfig:
         """The sampling configuration, ended where `relevant` inliers would have been found."""
@@ -57,6 +60,20 @@ class MatchedPair:
         """H on undistorted pixels."""
         return estimate_homography(*self._ideal_points(), ransac, rng=self.rng)
 
+    def bearings_under(self, factor: float) -> tuple[Bearings, Bearings]:
+        """Rays of both images with the guessed focal lengths multiplied by `factor`."""
+        cameras = (self.camera1, self.camera2)
+        first, second = (
+            _with_focal_factor(camera, factor) if guessed else camera
+            for camera, guessed in zip(cameras, self.guessed, strict=True)
+        )
+        return Bearings.of(self.points1, first), Bearings.of(self.points2, second)
+
+    def transfer_error(self, homography: Matrix3, inliers: Mask) -> float:
+        """Median distance in px at which a homography misses the inliers in image 2."""
+        first, second = self._ideal_points()
+        return float(np.nanmedian(transfer_errors(homography, first[inliers], second[inliers])))
+
     def tri_angle(self, pose: Rigid3, inliers: Mask) -> float:
         """Median angle in radians at which the rays of the inliers meet."""
         turned = pose.rotation @ self.bearings1.rays[inliers]
@@ -71,6 +88,12 @@ class MatchedPair:
     def _ideal_points(self) -> tuple[Points2D, Points2D]:
         first = _ideal_points(self.points1, self.bearings1, self.camera1)
         return first, _ideal_points(self.points2, self.bearings2, self.camera2)
+
+
+def _with_focal_factor(camera: Camera, factor: float) -> Camera:
+    params = camera.params.copy()
+    params[list(camera.model_info.focal_indices)] *= factor
+    return dataclasses.replace(camera, params=params)
 
 
 def _ideal_points(points2D: Points2D, bearings: Bearings, camera: Camera) -> Points2D:

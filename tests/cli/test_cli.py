@@ -87,6 +87,8 @@ def test_an_unknown_flag_is_answered_with_the_nearest(sfm):
         (["--set", "features.max_featurs=9"], "did you mean features.max_features"),
         (["--max-image-size", "-5"], "max_image_size must be"),
         (["--threads", "-1"], "--threads must not be negative"),
+        (["--pairs", "guess"], r"retrieval\.method must be auto \| exhaustive \| .*, got 'guess'"),
+        (["--pairs", "look", "--pair-list", "pairs.txt"], "--pairs and --pair-list exclude each other"),
     ],
 )
 def test_a_wrong_value_is_a_mistake_of_usage(sfm, tmp_path, words, pattern):

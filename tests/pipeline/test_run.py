@@ -64,7 +64,7 @@ def test_a_run_leaves_database_models_settings_manifest_and_logs(photos, tmp_pat
     assert report.models[0].mean_track_length == 2
     assert report.models[0].mean_error_px == pytest.approx(0.5)
     manifest = json.loads((tmp_path / "ws" / "manifest.json").read_text())
-    assert manifest["settings"]["features.max_image_size"] == 1600
+    assert manifest["settings"]["features.max_image_size"] == 3200
     assert set(manifest["stages"]) == {"images", "features", "matching", "verification", "mapping"}
     assert "[features]" in (tmp_path / "ws" / "sfm.toml").read_text()
     assert len(list((tmp_path / "ws" / "logs").glob("*.log"))) == 1

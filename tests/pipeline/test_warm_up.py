@@ -31,7 +31,9 @@ def test_the_made_up_scene_becomes_a_model_of_all_its_images():
     assert 200 < len(models[0].points3D) <= 240
 
 
-@pytest.mark.parametrize(("threads", "shares"), [(1, [["pair", "models"]]), (2, [["pair"], ["models"]])])
+@pytest.mark.parametrize(
+    ("threads", "shares"), [(1, [["pair", "models", "features"]]), (2, [["pair"], ["models"], ["features"]])]
+)
 def test_kernels_are_announced_compiled_and_marked_once(cache, monkeypatch, threads, shares):
     told, taken = [], []
     monkeypatch.setattr(warm_up, "_in_processes", lambda jobs: taken.append(jobs) or [])

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -79,3 +81,47 @@ def test_poses_follow_the_corrected_focal_lengths(rng):
         direction = motion.translation / np.linalg.norm(motion.translation)
         assert np.abs(geometry.cam2_from_cam1.translation - direction).max() < 1e-6
         assert geometry.tri_angle > 0.01
+
+
+def _known(factor):
+    """All focal lengths from EXIF, those of some images wrong by a factor."""
+    return {i: _camera(f * factor.get(i, 1.0), known=True) for i, f in TRUE_FOCALS.items()}
+
+
+def _kinds(graph, wrong):
+    """As verification finds them: E fails where a focal length is wrong."""
+    return ViewGraph(
+        {
+            pair: dataclasses.replace(one, kind=PairKind.UNCALIBRATED if wrong & set(pair) else PairKind.CALIBRATED)
+            for pair, one in graph.pairs.items()
+        }
+    )
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_exif_that_is_wrong_by_a_factor_of_two_is_corrected(rng, factor):
+    graph, _, _ = _scene(rng)
+    images = {i: i for i in TRUE_FOCALS}
+    found = calibrate_focal_lengths(
+        _kinds(graph, set(TRUE_FOCALS)), _known(dict.fromkeys(TRUE_FOCALS, factor)), images, doubt_known=True
+    )
+    for i, focal in TRUE_FOCALS.items():
+        assert found[i].mean_focal_length == pytest.approx(focal, rel=0.05)
+        assert not found[i].has_prior_focal_length
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_one_wrong_exif_among_right_ones_is_the_only_one_corrected(rng, factor):
+    graph, _, _ = _scene(rng)
+    cameras = _known({3: factor})
+    found = calibrate_focal_lengths(_kinds(graph, {3}), cameras, {i: i for i in TRUE_FOCALS}, doubt_known=True)
+    assert found[3].mean_focal_length == pytest.approx(TRUE_FOCALS[3], rel=0.03)
+    assert [i for i in TRUE_FOCALS if found[i] is not cameras[i]] == [3]
+
+
+def test_right_exif_and_a_given_calibration_are_not_doubted(rng):
+    graph, _, _ = _scene(rng)
+    images = {i: i for i in TRUE_FOCALS}
+    right, wrong = _known({}), _known(dict.fromkeys(TRUE_FOCALS, 2.0))
+    assert calibrate_focal_lengths(_kinds(graph, set()), right, images, doubt_known=True) == right
+    assert calibrate_focal_lengths(_kinds(graph, set(TRUE_FOCALS)), wrong, images) == wrong

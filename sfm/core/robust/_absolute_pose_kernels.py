@@ -13,17 +13,23 @@ Data are columns: r (3), B (6, by rows), X (3, world). Poses are R (9, by rows),
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit
 
-from sfm.core.robust._two_view_kernels import robust_weight
-
-_BLOCK = 64
+from sfm.core.robust._loss_kernels import robust_weight
+from sfm.core.robust._manifold_kernels import moved_pose
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def squared_reprojections(data, m, start, stop, out):
-    """Fills out[start:stop] with the squared errors in px² of the pose m."""
+class Resection(NamedTuple):
+    """The problem of an absolute pose: its columns (12, N), contiguous."""
+
+    data: np.ndarray
+
+
+def squared_errors(problem, model, start, stop, out):
+    """Fills out[start:stop] with the squared errors in px² of the pose `model`."""
+    data, m = problem.data, model
     for i in range(start, stop):
         a, b, c = data[9, i], data[10, i], data[11, i]
         x = m[0] * a + m[1] * b + m[2] * c + m[9]
@@ -35,35 +41,31 @@ def squared_reprojections(data, m, start, stop, out):
         out[i] = (u * u + v * v) / (along * along) if along > 0.0 else np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def best_pose(data, models, max_square, best_score, squares):
-    """As `best_model`, for poses."""
-    n = data.shape[1]
-    index, best_inliers = -1, 0
-    for k in range(models.shape[0]):
-        total, inliers = 0.0, 0
-        for start in range(0, n, _BLOCK):
-            if not total < best_score:
-                break
-            stop = min(start + _BLOCK, n)
-            squared_reprojections(data, models[k], start, stop, squares)
-            for i in range(start, stop):
-                if squares[i] < max_square:
-                    total += squares[i]
-                    inliers += 1
-                else:
-                    total += max_square
-        if total < best_score:
-            index, best_score, best_inliers = k, total, inliers
-    return index, best_score, best_inliers
+def parameters(problem):
+    return 6
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def pose_normal_equations(data, m, loss, square_scale, hessian, gradient):
+def start(problem, model, state):
+    for k in range(12):
+        state[k] = model[k]
+    return True
+
+
+def model_of(problem, state, model):
+    for k in range(12):
+        model[k] = state[k]
+
+
+def moved(problem, state, step):
+    return moved_pose(state, step)
+
+
+def equations(problem, state, loss, square_scale, max_square, hessian, gradient):
     """Adds JᵀWJ (6, 6) and JᵀWr to `hessian` and `gradient`; returns Σ ρ(r²).
 
     With s = r · x, the derivative of the residual by x is (B − residual rᵀ) / s.
     """
+    data, m = problem.data, state
     turned, rows, residual, by_point = np.empty(3), np.empty((2, 6)), np.empty(2), np.empty(3)
     cost = 0.0
     for i in range(data.shape[1]):
@@ -76,7 +78,7 @@ def pose_normal_equations(data, m, loss, square_scale, hessian, gradient):
             v += data[6 + j, i] * x
         # A point behind its ray costs as much as any point that is far away.
         square = (u * u + v * v) / (along * along) if along > 0.0 else 1e12
-        rho, weight = robust_weight(square, loss, square_scale)
+        rho, weight = robust_weight(square, loss, square_scale, max_square)
         cost += rho
         if weight == 0.0 or not along > 0.0:
             continue

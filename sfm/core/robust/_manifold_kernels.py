@@ -2,12 +2,11 @@
 
 States are flat rows; 3 × 3 matrices are stored by rows. Rotations are updated on the left, R ← exp([ω]×) R.
 
-    essential      R (9), unit t (3)            E = [t]× R                5 parameters: ω, two in the plane ⟂ t
-    fundamental    U (9), V (9), σ              F = U diag(1, σ, 0) Vᵀ     7 parameters: of U, of V, σ
-    pose           R (9), t (3)                                           6 parameters: ω, υ; t ← t + υ
+    essential      R (9), unit t (3)     E = [t]× R    5 parameters: two of t in the plane ⟂ t, ω
+    fundamental    M (9), unit t (3)     F = [t]× M    8 parameters: two of t, six of M in that plane; one is the scale
+    pose           R (9), t (3)                        6 parameters: ω, υ; t ← t + υ
 
-Reference:
-    Bartoli & Sturm, Nonlinear estimation of the fundamental matrix with minimal parameters, PAMI 2004.
+Nothing depends on the scale of F, which is why the damping of the normal equations must not vanish.
 """
 
 from __future__ import annotations
@@ -55,14 +54,22 @@ def _plane_basis(t, basis):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def moved_essential(state, step):
-    """The state after a step of five."""
+def moved_matrix(state, step):
+    """The state of an essential or, with steps of eight, a fundamental matrix after a step."""
     new, basis = state.copy(), np.empty((2, 3))
-    rotate(new, step[0], step[1], step[2])
     _plane_basis(state[9:], basis)
+    if step.shape[0] == 5:
+        rotate(new, step[2], step[3], step[4])
+    else:
+        square = 0.0
+        for i in range(9):
+            new[i] += step[2 + i % 3] * basis[0, i // 3] + step[5 + i % 3] * basis[1, i // 3]
+            square += new[i] * new[i]
+        for i in range(9):
+            new[i] /= np.sqrt(square)
     square = 0.0
     for i in range(3):
-        new[9 + i] += step[3] * basis[0, i] + step[4] * basis[1, i]
+        new[9 + i] += step[0] * basis[0, i] + step[1] * basis[1, i]
         square += new[9 + i] * new[9 + i]
     for i in range(3):
         new[9 + i] /= np.sqrt(square)
@@ -70,48 +77,62 @@ def moved_essential(state, step):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def essential_tangent(state):
-    """E (9,) and its derivatives (5, 9)."""
-    essential, tangent, rotated = np.empty(9), np.empty((5, 9)), np.empty(9)
-    _cross_product(state[9:], state, essential)
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        for j in range(3):
-            rotated[3 * k + j], rotated[3 * a + j], rotated[3 * b + j] = 0.0, -state[3 * b + j], state[3 * a + j]
-        _cross_product(state[9:], rotated, tangent[k])
-    basis = np.empty((2, 3))
+def matrix_of(state, model):
+    """Fills `model` with [t]× M."""
+    _cross_product(state[9:], state, model)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def matrix_tangent(state, tangent):
+    """Fills `tangent` (5 or 8, 9) with the derivatives of [t]× M by the steps of `moved_matrix`."""
+    basis, changed = np.empty((2, 3)), np.zeros(9)
     _plane_basis(state[9:], basis)
     for k in range(2):
-        _cross_product(basis[k], state, tangent[3 + k])
-    return essential, tangent
+        _cross_product(basis[k], state, tangent[k])
+    if tangent.shape[0] == 5:
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            for j in range(3):
+                changed[3 * k + j], changed[3 * a + j], changed[3 * b + j] = 0.0, -state[3 * b + j], state[3 * a + j]
+            _cross_product(state[9:], changed, tangent[2 + k])
+    else:
+        # [t]× takes the first vector of the basis to the second, and this to minus the first.
+        for i in range(9):
+            for j in range(3):
+                same = 1.0 if i % 3 == j else 0.0
+                tangent[2 + j, i], tangent[5 + j, i] = same * basis[1, i // 3], -same * basis[0, i // 3]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def moved_fundamental(state, step):
-    """The state after a step of seven."""
-    new = state.copy()
-    rotate(new, step[0], step[1], step[2])
-    rotate(new[9:], step[3], step[4], step[5])
-    new[18] += step[6]
-    return new
+def matrix_state(m, calibrated, state):
+    """Fills `state` from E or F; False where its rank is below two.
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fundamental_tangent(state):
-    """F (9,) and its derivatives (7, 9)."""
-    fundamental, tangent = np.empty(9), np.empty((7, 9))
+    The left null vector t is the longest cross product of two columns, and M = −[t]× F. With E of norm √2 the cofactors
+    are t tᵀ R, so that R = cof E − [t]× E.
+    """
+    cofactors, square, longest, best = np.empty((3, 3)), 0.0, 0.0, 0
+    for j in range(3):
+        c, d = (j + 1) % 3, (j + 2) % 3
+        norm = 0.0
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            square += m[3 * i + j] * m[3 * i + j]
+            cofactors[i, j] = m[3 * a + c] * m[3 * b + d] - m[3 * a + d] * m[3 * b + c]
+            norm += cofactors[i, j] * cofactors[i, j]
+        if norm > longest:
+            longest, best = norm, j
+    if not (longest > 1e-20 * square * square and square < np.inf):
+        return False
     for i in range(3):
+        state[9 + i] = -cofactors[i, best] / np.sqrt(longest)
+    _cross_product(state[9:], m, state)
+    for i in range(3):
+        state[9 + i] = -state[9 + i]
         for j in range(3):
-            tangent[6, 3 * i + j] = state[3 * i + 1] * state[9 + 3 * j + 1]
-            fundamental[3 * i + j] = state[3 * i] * state[9 + 3 * j] + state[18] * tangent[6, 3 * i + j]
-    # [e_k]× F and F [e_k]×ᵀ: two rows, or columns, change places and one its sign.
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        for j in range(3):
-            tangent[k, 3 * k + j] = tangent[3 + k, 3 * j + k] = 0.0
-            tangent[k, 3 * a + j], tangent[k, 3 * b + j] = -fundamental[3 * b + j], fundamental[3 * a + j]
-            tangent[3 + k, 3 * j + a], tangent[3 + k, 3 * j + b] = -fundamental[3 * j + b], fundamental[3 * j + a]
-    return fundamental, tangent
+            state[3 * i + j] *= np.sqrt(2.0 / square)
+            if calibrated:
+                state[3 * i + j] += cofactors[i, j] * 2.0 / square
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Squared errors, their normal equations and scores for the matrices of two views.
+"""The problems of two views: essential, fundamental and homography matrices.
 
 Errors are first-order geometric (Sampson) distances, in the units of the data, summed over both images. With e the
 algebraic error of a correspondence and ∇e its gradient by the coordinates of both keypoints:
@@ -19,18 +19,28 @@ References:
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 
+from sfm.core.robust import _manifold_kernels as manifold
+from sfm.core.robust._loss_kernels import robust_weight
+
 ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY = 0, 1, 2
-TRUNCATED, CAUCHY = 0, 1
-_BLOCK = 64
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def squared_errors(problem, data, m, start, stop, out):
-    """Fills out[start:stop] with the squared errors of the model m (9,), a matrix by rows."""
-    if problem == ESSENTIAL:
+class TwoViews(NamedTuple):
+    """A problem of two views: which, and its columns (rows, N), contiguous."""
+
+    kind: int
+    data: np.ndarray
+
+
+def squared_errors(problem, model, start, stop, out):
+    """Fills out[start:stop] with the squared errors of the model m, a matrix by rows."""
+    kind, data, m = problem.kind, problem.data, model
+    if kind == ESSENTIAL:
         for i in range(start, stop):
             x1, y1, z1 = data[0, i], data[1, i], data[2, i]
             x2, y2, z2 = data[3, i], data[4, i], data[5, i]
@@ -46,7 +56,7 @@ def squared_errors(problem, data, m, start, stop, out):
             g2 = a0 * data[12, i] + a1 * data[14, i] + a2 * data[16, i]
             g3 = a0 * data[13, i] + a1 * data[15, i] + a2 * data[17, i]
             out[i] = e * e / (g0 * g0 + g1 * g1 + g2 * g2 + g3 * g3 + 1e-300)
-    elif problem == FUNDAMENTAL:
+    elif kind == FUNDAMENTAL:
         for i in range(start, stop):
             x1, y1, x2, y2 = data[0, i], data[1, i], data[2, i], data[3, i]
             a0 = m[0] * x1 + m[1] * y1 + m[2]
@@ -68,100 +78,116 @@ def squared_errors(problem, data, m, start, stop, out):
             out[i] = (s * e0 * e0 - 2.0 * q * e0 * e1 + p * e1 * e1) / (p * s - q * q)
 
 
+def parameters(problem):
+    return 5 if problem.kind == ESSENTIAL else 8
+
+
+def start(problem, model, state):
+    """Any of the four decompositions of E serves, since all have the same E up to sign."""
+    if problem.kind != HOMOGRAPHY:
+        return manifold.matrix_state(model, problem.kind == ESSENTIAL, state)
+    # H[2, 2] vanishes only if the centre of the data is mapped to infinity.
+    unit = model[8] if abs(model[8]) > 1e-9 else 1e-9
+    for k in range(9):
+        state[k] = model[k] / unit
+    return True
+
+
+def model_of(problem, state, model):
+    if problem.kind == HOMOGRAPHY:
+        for k in range(9):
+            model[k] = state[k]
+    else:
+        manifold.matrix_of(state, model)
+
+
+def moved(problem, state, step):
+    if problem.kind != HOMOGRAPHY:
+        return manifold.moved_matrix(state, step)
+    new = state.copy()
+    for k in range(8):
+        new[k] += step[k]
+    return new
+
+
+def equations(problem, state, loss, square_scale, max_square, hessian, gradient):
+    if problem.kind == HOMOGRAPHY:
+        return _homography_equations(problem.data, state, loss, square_scale, max_square, hessian, gradient)
+    model, tangent = np.empty(9), np.empty((hessian.shape[0], 9))
+    manifold.matrix_of(state, model)
+    manifold.matrix_tangent(state, tangent)
+    return epipolar_equations(problem, model, tangent, loss, square_scale, max_square, hessian, gradient)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def best_model(problem, data, models, max_square, best_score, squares):
-    """The model of the lowest truncated score Σ min(r², max_square) below `best_score`, its score and its inliers.
-
-    The index is −1 if none is better. A model is abandoned as soon as its partial sum is too high.
-    """
-    n = data.shape[1]
-    index, best_inliers = -1, 0
-    for k in range(models.shape[0]):
-        total, inliers = 0.0, 0
-        for start in range(0, n, _BLOCK):
-            if not total < best_score:
-                break
-            stop = min(start + _BLOCK, n)
-            squared_errors(problem, data, models[k], start, stop, squares)
-            for i in range(start, stop):
-                if squares[i] < max_square:
-                    total += squares[i]
-                    inliers += 1
-                else:
-                    total += max_square
-        if total < best_score:
-            index, best_score, best_inliers = k, total, inliers
-    return index, best_score, best_inliers
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def robust_weight(square, loss, square_scale):
-    """ρ and dρ/d(r²) at r² = square: truncated at `square_scale`, or Cauchy's."""
-    if loss == TRUNCATED:
-        return (square, 1.0) if square < square_scale else (square_scale, 0.0)
-    ratio = 1.0 + square / square_scale
-    return square_scale * np.log(ratio), 1.0 / ratio
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def epipolar_normal_equations(problem, data, m, tangent, loss, square_scale, hessian, gradient):
+def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hessian, gradient):
     """Adds JᵀWJ and JᵀWr of the epipolar errors of m (9,) to `hessian`, `gradient`; returns Σ ρ(r²).
 
     `tangent` (dof, 9) holds the derivatives of m by the parameters. With a = J1 ∇1, b = J2 ∇2 and κ = e / |∇|²,
         dr/dM = (r2 (r1 − κ a)ᵀ − κ b r1ᵀ) / |∇|.
+    The sums are taken over M, of nine numbers for either matrix, and brought to the parameters at the end.
     """
-    dof = tangent.shape[0]
-    row = np.empty(dof)
-    r, a = np.empty((2, 3)), np.empty((2, 3))
-    jacobians = np.zeros((2, 3, 2))
-    jacobians[0, 0, 0] = jacobians[0, 1, 1] = jacobians[1, 0, 0] = jacobians[1, 1, 1] = 1.0
+    data, calibrated = problem.data, problem.kind == ESSENTIAL
+    square, product, d = np.zeros((9, 9)), np.zeros(9), np.empty(9)
     cost = 0.0
     for i in range(data.shape[1]):
-        for v in range(2):
-            if problem == ESSENTIAL:
-                for k in range(3):
-                    r[v, k] = data[3 * v + k, i]
-                    jacobians[v, k, 0] = data[6 * v + 2 * k + 6, i]
-                    jacobians[v, k, 1] = data[6 * v + 2 * k + 7, i]
-            else:
-                r[v, 0], r[v, 1], r[v, 2] = data[2 * v, i], data[2 * v + 1, i], 1.0
-        e, norm = 0.0, 1e-300
-        for v in range(2):
-            # The line of the other view's ray in this view, its gradient by the pixel, and back to ray space.
-            g0, g1 = 0.0, 0.0
-            for k in range(3):
-                line = 0.0
-                for j in range(3):
-                    line += (m[3 * j + k] if v == 0 else m[3 * k + j]) * r[1 - v, j]
-                if v == 0:
-                    e += line * r[0, k]
-                g0 += line * jacobians[v, k, 0]
-                g1 += line * jacobians[v, k, 1]
-            norm += g0 * g0 + g1 * g1
-            for k in range(3):
-                a[v, k] = jacobians[v, k, 0] * g0 + jacobians[v, k, 1] * g1
-        rho, weight = robust_weight(e * e / norm, loss, square_scale)
+        if calibrated:
+            x1, y1, z1, x2, y2, z2 = data[0, i], data[1, i], data[2, i], data[3, i], data[4, i], data[5, i]
+        else:
+            x1, y1, z1, x2, y2, z2 = data[0, i], data[1, i], 1.0, data[2, i], data[3, i], 1.0
+        a0 = m[0] * x1 + m[1] * y1 + m[2] * z1
+        a1 = m[3] * x1 + m[4] * y1 + m[5] * z1
+        a2 = m[6] * x1 + m[7] * y1 + m[8] * z1
+        b0 = m[0] * x2 + m[3] * y2 + m[6] * z2
+        b1 = m[1] * x2 + m[4] * y2 + m[7] * z2
+        b2 = m[2] * x2 + m[5] * y2 + m[8] * z2
+        e = a0 * x2 + a1 * y2 + a2 * z2
+        if calibrated:
+            g0 = b0 * data[6, i] + b1 * data[8, i] + b2 * data[10, i]
+            g1 = b0 * data[7, i] + b1 * data[9, i] + b2 * data[11, i]
+            g2 = a0 * data[12, i] + a1 * data[14, i] + a2 * data[16, i]
+            g3 = a0 * data[13, i] + a1 * data[15, i] + a2 * data[17, i]
+        else:
+            g0, g1, g2, g3 = b0, b1, a0, a1
+        norm = g0 * g0 + g1 * g1 + g2 * g2 + g3 * g3 + 1e-300
+        rho, weight = robust_weight(e * e / norm, loss, square_scale, max_square)
         cost += rho
         if weight == 0.0:
             continue
-        kappa, inverse = e / norm, 1.0 / np.sqrt(norm)
-        for p in range(dof):
-            row[p] = 0.0
-        for j in range(3):
-            for k in range(3):
-                d = r[1, j] * (r[0, k] - kappa * a[0, k]) - kappa * a[1, j] * r[0, k]
-                for p in range(dof):
-                    row[p] += d * tangent[p, 3 * j + k]
-        for p in range(dof):
-            jacobian = weight * inverse * row[p]
-            gradient[p] += jacobian * e * inverse
+        kappa = e / norm
+        weight /= norm
+        if calibrated:
+            # Back to ray space: κ J1 ∇1 and κ J2 ∇2.
+            p0 = kappa * (data[6, i] * g0 + data[7, i] * g1)
+            p1 = kappa * (data[8, i] * g0 + data[9, i] * g1)
+            p2 = kappa * (data[10, i] * g0 + data[11, i] * g1)
+            q0 = kappa * (data[12, i] * g2 + data[13, i] * g3)
+            q1 = kappa * (data[14, i] * g2 + data[15, i] * g3)
+            q2 = kappa * (data[16, i] * g2 + data[17, i] * g3)
+        else:
+            p0, p1, p2, q0, q1, q2 = kappa * g0, kappa * g1, 0.0, kappa * g2, kappa * g3, 0.0
+        p0, p1, p2 = x1 - p0, y1 - p1, z1 - p2
+        d[0], d[1], d[2] = x2 * p0 - q0 * x1, x2 * p1 - q0 * y1, x2 * p2 - q0 * z1
+        d[3], d[4], d[5] = y2 * p0 - q1 * x1, y2 * p1 - q1 * y1, y2 * p2 - q1 * z1
+        d[6], d[7], d[8] = z2 * p0 - q2 * x1, z2 * p1 - q2 * y1, z2 * p2 - q2 * z1
+        for j in range(9):
+            left = weight * d[j]
+            product[j] += left * e
+            for k in range(9):
+                square[j, k] += left * d[k]
+    for p in range(tangent.shape[0]):
+        for k in range(9):
+            gradient[p] += tangent[p, k] * product[k]
+            row = 0.0
+            for j in range(9):
+                row += tangent[p, j] * square[j, k]
             for q in range(p + 1):
-                hessian[p, q] += jacobian * inverse * row[q]
+                hessian[p, q] += row * tangent[q, k]
     return cost
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def homography_normal_equations(data, m, loss, square_scale, hessian, gradient):
+def _homography_equations(data, m, loss, square_scale, max_square, hessian, gradient):
     """The same for a homography with m[8] fixed; (I + A Aᵀ)⁻¹ is taken as constant in the derivative."""
     row0, row1 = np.zeros(8), np.zeros(8)
     cost = 0.0
@@ -175,7 +201,9 @@ def homography_normal_equations(data, m, loss, square_scale, hessian, gradient):
         c, d = (m[3] - v * m[6]) * w, (m[4] - v * m[7]) * w
         p, q, s = 1.0 + a * a + b * b, a * c + b * d, 1.0 + c * c + d * d
         det = p * s - q * q
-        rho, weight = robust_weight((s * e0 * e0 - 2.0 * q * e0 * e1 + p * e1 * e1) / det, loss, square_scale)
+        rho, weight = robust_weight(
+            (s * e0 * e0 - 2.0 * q * e0 * e1 + p * e1 * e1) / det, loss, square_scale, max_square
+        )
         cost += rho
         if weight == 0.0:
             continue

@@ -12,14 +12,15 @@ from sfm.core.errors import Rejected
 from sfm.core.geometry.minimal._p3p_kernels import p3p
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
-from sfm.core.robust import _absolute_pose_kernels as kernels
+from sfm.core.robust._absolute_pose_kernels import Resection
+from sfm.core.robust._loss_kernels import CAUCHY, TRUNCATED
 from sfm.core.robust._manifold_kernels import moved_pose
-from sfm.core.robust._two_view_kernels import CAUCHY, TRUNCATED
-from sfm.core.robust.ransac import Estimate, RansacConfig, polish, ransac, refine
-from sfm.core.robust.relative_pose import check_lengths, scatter
+from sfm.core.robust.ransac import CompiledProblem, Estimate, RansacConfig, Solver, ransac
+from sfm.core.robust.refinement import polish, refine
+from sfm.core.robust.relative_pose import check_lengths, chosen, finite_rows, scatter
 
 _FOCAL_FACTORS = np.geomspace(0.4, 2.5, 9)
-_SCAN_ITERATIONS = 50
+_SCAN_ITERATIONS, _FOCAL_STEPS = 50, 15
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -41,56 +42,21 @@ class AbsolutePoseEstimate(Value):
         object.__setattr__(self, "inliers", readonly(self.inliers, (len(self.inliers),), np.bool_))
 
 
-class AbsolutePoseProblem:
-    """Tangent reprojection errors in px. Models and states are R, t."""
+def resection(
+    points2D: Points2D, points3D: Points3D, camera: Camera, max_error_px: float
+) -> tuple[CompiledProblem, Mask]:
+    """The sampling problem of the finite points whose pixels have a ray, and which these are.
 
-    sample_size = 3
-
-    def __init__(self, points2D: Points2D, points3D: Points3D, camera: Camera, max_error: float) -> None:
-        rays, valid = camera.unproject(points2D)
-        _, by_point, _, projects = camera.project_with_jacobians(rays)
-        self.usable = valid & projects & np.isfinite(points2D).all(1) & np.isfinite(points3D).all(1)
-        self.camera, self.max_error, self.count = camera, max_error, int(self.usable.sum())
-        self.points2D, self.points3D = points2D[self.usable], points3D[self.usable]
-        columns = (rays[self.usable], by_point[self.usable].reshape(-1, 6), self.points3D)
-        self._data = np.ascontiguousarray(np.concatenate(columns, axis=1).T)
-        self._squares = np.empty(self.count)
-
-    def propose(self, samples: np.ndarray) -> FloatArray:
-        """See `Problem`."""
-        models = np.empty((4 * len(samples), 12))
-        return models[: p3p(self._data, samples, models)]
-
-    def best(self, models: FloatArray, score: float) -> tuple[int, float, int]:
-        """See `Problem`."""
-        return kernels.best_pose(self._data, models, self.max_error**2, score, self._squares)
-
-    def squared_errors(self, model: FloatArray) -> FloatArray:
-        """See `Problem`."""
-        out = np.empty(self.count)
-        kernels.squared_reprojections(self._data, model, 0, self.count, out)
-        return out
-
-    def state(self, model: FloatArray) -> FloatArray:
-        """See `Problem`."""
-        return model
-
-    def model(self, state: FloatArray) -> FloatArray:
-        """See `Problem`."""
-        return state
-
-    def moved(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """See `Problem`."""
-        return moved_pose(state, step)
-
-    def normal_equations(self, state: FloatArray, loss: int, scale: float) -> tuple[float, FloatArray, FloatArray]:
-        """See `Problem`."""
-        hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-        cost = kernels.pose_normal_equations(self._data, state, loss, scale**2, hessian, gradient)
-        return cost, hessian, gradient
+    Errors are tangent reprojection errors in px; models and states are R (9), t (3).
+    """
+    rays, valid = camera.unproject(points2D)
+    _, by_point, _, projects = camera.project_with_jacobians(rays)
+    usable = valid & projects & np.isfinite(points2D).all(1) & np.isfinite(points3D).all(1)
+    data = np.concatenate([rays, by_point.reshape(-1, 6), points3D], axis=1)[usable]
+    return CompiledProblem(Resection(np.ascontiguousarray(data.T)), Solver(p3p, 3, 4), max_error_px), usable
 
 
-class ReprojectionProblem(AbsolutePoseProblem):
+class ReprojectionProblem:
     """Exact reprojection errors. States are R, t and, with `refine_focal`, the logarithm of a focal factor."""
 
     def __init__(
@@ -103,7 +69,9 @@ class ReprojectionProblem(AbsolutePoseProblem):
         refine_focal: bool,
         weights: Vector | None = None,
     ) -> None:
-        super().__init__(points2D, points3D, camera, max_error)
+        self.usable = finite_rows(points2D) & finite_rows(points3D)
+        self.camera, self.max_error, self.count = camera, max_error, int(self.usable.sum())
+        self.points2D, self.points3D = points2D[self.usable], points3D[self.usable]
         self._focal = list(camera.model_info.focal_indices) if refine_focal else []
         self._weights = np.ones(self.count) if weights is None else weights[self.usable]
 
@@ -115,24 +83,20 @@ class ReprojectionProblem(AbsolutePoseProblem):
         params[self._focal] *= np.exp(np.clip(state[12], -3.0, 3.0))
         return dataclasses.replace(self.camera, params=params)
 
-    def best(self, models: FloatArray, score: float) -> tuple[int, float, int]:
-        """See `Problem`; minimal models, which have no focal factor, are scored by their tangent errors."""
-        if not len(models) or models.shape[1] == 12:
-            return super().best(models, score)
-        squares = self.squared_errors(models[0])
-        own = float(np.minimum(squares, self.max_error**2).sum())
-        return (0 if own < score else -1), own, int((squares < self.max_error**2).sum())
-
-    def squared_errors(self, model: FloatArray) -> FloatArray:
+    def squared_errors(self, state: FloatArray) -> FloatArray:
         """See `Problem`."""
-        pixels, valid = self.camera_of(model).project(self._in_camera(model))
+        pixels, valid = self.camera_of(state).project(self._in_camera(state))
         return np.where(valid, np.square(pixels - self.points2D).sum(1), np.inf)
 
     def state(self, model: FloatArray) -> FloatArray:
         """See `Problem`."""
         return np.append(model, 0.0) if self._focal and len(model) == 12 else model
 
-    def normal_equations(self, state: FloatArray, loss: int, scale: float) -> tuple[float, FloatArray, FloatArray]:
+    def moved(self, state: FloatArray, step: FloatArray) -> FloatArray:
+        """See `Problem`."""
+        return moved_pose(state, step)
+
+    def normal_equations(self, state: FloatArray, loss: np.int64, scale: float) -> tuple[float, FloatArray, FloatArray]:
         """See `Problem`."""
         camera, points = self.camera_of(state), self._in_camera(state)
         pixels, by_point, by_params, valid = camera.project_with_jacobians(points)
@@ -152,7 +116,7 @@ class ReprojectionProblem(AbsolutePoseProblem):
         return self.points3D @ state[:9].reshape(3, 3).T + state[9:12]
 
 
-def _robust(squares: Vector, loss: int, square_scale: float) -> tuple[Vector, Vector]:
+def _robust(squares: Vector, loss: np.int64, square_scale: float) -> tuple[Vector, Vector]:
     """ρ and its derivative, as `robust_weight`."""
     if loss == TRUNCATED:
         return np.minimum(squares, square_scale), (squares < square_scale).astype(np.float64)
@@ -167,33 +131,36 @@ def estimate_absolute_pose(
     *,
     rng: np.random.Generator,
     refine_focal: bool = False,
+    quality: Vector | None = None,
 ) -> AbsolutePoseEstimate | Rejected:
-    """The pose that most points agree with, by P3P and LO-RANSAC, refined on exact reprojection errors.
+    """The pose that most points agree with, by P3P and LO-RANSAC.
 
-    Sampling uses tangent reprojection errors, in px for any camera model; only points in front of their ray count.
+    Sampling and refinement use tangent reprojection errors, in px for any camera model, which at 12 px differ from the
+    exact ones by a hundredth at most; only points in front of their ray count. Inliers are those of the exact errors.
     With `refine_focal` the camera's focal length is a guess: nine factors from 0.4 to 2.5 are tried by short runs,
     the best is sampled in full, and pose and focal length are refined together. A planar scene that is seen
     frontally leaves the focal length undetermined.
 
     Args:
         points2D: (N, 2) px; points3D: (N, 3) their points in the world. Rows that are not finite are never inliers.
+        quality: (N,) larger for points that are more likely right (see `ransac`).
     Raises:
-        ValueError: the point sets differ in length.
+        ValueError: the point sets or the qualities differ in length.
     """
     check_lengths(points2D, points3D)
     refine_focal = refine_focal and bool(camera.model_info.focal_indices)
     if refine_focal:
         camera = _scanned_focal(points2D, points3D, camera, config, rng)
-    exact = ReprojectionProblem(points2D, points3D, camera, config.max_error_px, refine_focal=refine_focal)
-    tangent = AbsolutePoseProblem(points2D, points3D, camera, config.max_error_px)
-    estimate = ransac(exact if refine_focal else tangent, config, rng)
+    tangent, usable = resection(points2D, points3D, camera, config.max_error_px)
+    estimate = ransac(tangent, config, rng, chosen(quality, usable))
     if not isinstance(estimate, Estimate):
         return estimate
-    state = polish(exact, estimate.state)
-    inliers = exact.squared_errors(state) < config.max_error_px**2
-    return AbsolutePoseEstimate(
-        _rigid(state), exact.camera_of(state), scatter(inliers, exact.usable), estimate.iterations
-    )
+    exact = ReprojectionProblem(points2D, points3D, camera, config.max_error_px, refine_focal=refine_focal)
+    state = exact.state(estimate.model)
+    if refine_focal:
+        state = polish(exact, refine(exact, state, TRUNCATED, config.max_error_px, _FOCAL_STEPS))
+    inliers = scatter(exact.squared_errors(state) < config.max_error_px**2, exact.usable) & usable
+    return AbsolutePoseEstimate(_rigid(state), exact.camera_of(state), inliers, estimate.iterations)
 
 
 def refine_absolute_pose(
@@ -240,12 +207,15 @@ def _scanned_focal(
         params = camera.params.copy()
         params[list(camera.model_info.focal_indices)] *= factor
         candidate = dataclasses.replace(camera, params=params)
-        problem = ReprojectionProblem(points2D, points3D, candidate, config.max_error_px, refine_focal=True)
-        estimate = ransac(problem, short, rng)
-        if isinstance(estimate, Estimate):
-            score = estimate.score + (len(points2D) - problem.count) * config.max_error_px**2
-            if score < best_score:
-                best, best_score = problem.camera_of(estimate.state), score
+        tangent, _ = resection(points2D, points3D, candidate, config.max_error_px)
+        estimate = ransac(tangent, short, rng)
+        if not isinstance(estimate, Estimate):
+            continue
+        exact = ReprojectionProblem(points2D, points3D, candidate, config.max_error_px, refine_focal=True)
+        state = refine(exact, exact.state(estimate.model), TRUNCATED, config.max_error_px, _FOCAL_STEPS)
+        score = float(np.minimum(exact.squared_errors(state), config.max_error_px**2).sum())
+        if score < best_score:
+            best, best_score = exact.camera_of(state), score
     return best
 
 

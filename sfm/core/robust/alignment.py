@@ -7,7 +7,7 @@ import numpy as np
 from sfm.core.arrays import Mask, Points3D, Vector
 from sfm.core.errors import Rejected
 from sfm.core.geometry.similarity import Sim3, estimate_similarity
-from sfm.core.robust.ransac import RansacConfig, draw_samples, required_iterations
+from sfm.core.robust.ransac import RansacConfig, required_iterations
 from sfm.core.robust.relative_pose import check_lengths
 
 _CONFIG = RansacConfig(min_iterations=100, max_iterations=2000)
@@ -39,7 +39,7 @@ def align_robust(
     best, best_score, drawn, limit = None, len(a) * max_error**2, 0, _CONFIG.max_iterations
     while drawn < limit:
         drawn += 1
-        sample = draw_samples(1, 3, len(a), rng)[0]
+        sample = rng.choice(len(a), 3, replace=False)
         candidate = estimate_similarity(a[sample], b[sample], with_scale=with_scale)
         if not isinstance(candidate, Sim3) or _score(candidate, a, b, max_error)[0] >= best_score:
             continue

@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from sfm.core.arrays import Mask, Matrix3, Points2D, Value, readonly
+from sfm.core.arrays import Mask, Matrix3, Points2D, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.robust.ransac import Estimate, RansacConfig, ransac
-from sfm.core.robust.relative_pose import check_lengths, finite_rows, scatter
-from sfm.core.robust.two_view import FundamentalProblem, HomographyProblem, common_normalisation
+from sfm.core.robust.relative_pose import check_lengths, chosen, finite_rows, scatter
+from sfm.core.robust.two_view import common_normalisation, fundamental_matrix, homography_matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -32,23 +32,26 @@ def estimate_fundamental(
     config: RansacConfig = RansacConfig(),
     *,
     rng: np.random.Generator,
+    quality: Vector | None = None,
 ) -> MatrixEstimate | Rejected:
     """F of rank two with x2ᵀ F x1 = 0, by the seven-point solver and LO-RANSAC on Sampson errors in px.
 
     A planar scene leaves F undetermined: the result then explains the pairs, but its epipoles mean nothing.
 
+    Args:
+        quality: (N,) larger for pairs that are more likely right (see `ransac`).
     Raises:
-        ValueError: the point sets differ in length.
+        ValueError: the point sets or the qualities differ in length.
     """
     check_lengths(points2D_1, points2D_2)
     usable = finite_rows(points2D_1) & finite_rows(points2D_2)
     if not usable.any():
         return Rejected("too_few_points", "no finite pair of points")
     columns, t1, t2 = common_normalisation(points2D_1[usable], points2D_2[usable])
-    estimate = ransac(FundamentalProblem(columns, config.max_error_px * t1[0, 0]), config, rng)
+    estimate = ransac(fundamental_matrix(columns, config.max_error_px * t1[0, 0]), config, rng, chosen(quality, usable))
     if not isinstance(estimate, Estimate):
         return estimate
-    matrix = t2.T @ estimate.model.reshape(3, 3) @ t1
+    matrix = t2.T @ estimate.model[:9].reshape(3, 3) @ t1
     return MatrixEstimate(matrix / np.linalg.norm(matrix), scatter(estimate.inliers, usable), estimate.iterations)
 
 
@@ -58,23 +61,26 @@ def estimate_homography(
     config: RansacConfig = RansacConfig(),
     *,
     rng: np.random.Generator,
+    quality: Vector | None = None,
 ) -> MatrixEstimate | Rejected:
     """H with x2 ~ H x1, by four points and LO-RANSAC on Sampson errors in px, which treat both images alike.
 
     The sign of H is such that the inliers have w > 0.
 
+    Args:
+        quality: (N,) larger for pairs that are more likely right (see `ransac`).
     Raises:
-        ValueError: the point sets differ in length.
+        ValueError: the point sets or the qualities differ in length.
     """
     check_lengths(points2D_1, points2D_2)
     usable = finite_rows(points2D_1) & finite_rows(points2D_2)
     if not usable.any():
         return Rejected("too_few_points", "no finite pair of points")
     columns, t1, t2 = common_normalisation(points2D_1[usable], points2D_2[usable])
-    estimate = ransac(HomographyProblem(columns, config.max_error_px * t1[0, 0]), config, rng)
+    estimate = ransac(homography_matrix(columns, config.max_error_px * t1[0, 0]), config, rng, chosen(quality, usable))
     if not isinstance(estimate, Estimate):
         return estimate
-    h = estimate.model.reshape(3, 3)
+    h = estimate.model[:9].reshape(3, 3)
     w = h[2, :2] @ columns[:2, estimate.inliers] + h[2, 2]
     matrix = np.linalg.solve(t2, h) @ t1 * (1.0 if np.median(w) > 0 else -1.0)
     return MatrixEstimate(matrix / np.linalg.norm(matrix), scatter(estimate.inliers, usable), estimate.iterations)

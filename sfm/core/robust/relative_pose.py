@@ -7,13 +7,14 @@ import dataclasses
 import numpy as np
 from jaxtyping import Bool
 
-from sfm.core.arrays import FloatArray, Mask, Matrix3, Points2D, Rays, Value, readonly
+from sfm.core.arrays import FloatArray, Mask, Matrix3, Points2D, Rays, Value, Vector, readonly
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.geometry.epipolar import essential_from_pose, pose_from_essential, ray_jacobians
+from sfm.core.geometry.epipolar import decompose_essential, essential_from_pose, pose_from_essential, ray_jacobians
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.robust.ransac import Estimate, RansacConfig, polish, ransac
-from sfm.core.robust.two_view import EssentialProblem
+from sfm.core.robust._problem_kernels import SIZE
+from sfm.core.robust.ransac import CompiledProblem, Estimate, RansacConfig, polish, ransac
+from sfm.core.robust.two_view import essential_matrix
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +79,18 @@ def finite_rows(points: FloatArray) -> Mask:
     return np.asarray(np.isfinite(points).all(axis=1))
 
 
+def chosen(values: Vector | None, rows: Mask) -> Vector | None:
+    """The values of the rows that are True.
+
+    Raises:
+        ValueError: there is not one value for each row.
+    """
+    if values is None:
+        return None
+    check_lengths(rows, values)
+    return values[rows]
+
+
 def scatter(mask: Bool[np.ndarray, " K"], rows: Mask) -> Mask:
     """`mask`, which holds for the rows that are True, on all rows."""
     out = np.zeros(len(rows), dtype=np.bool_)
@@ -93,30 +106,40 @@ def estimate_relative_pose(
     config: RansacConfig = RansacConfig(),
     *,
     rng: np.random.Generator,
+    quality: Vector | None = None,
 ) -> RelativePoseEstimate | Rejected:
     """The relative pose that most pairs of keypoints agree with, by the five-point solver and LO-RANSAC.
 
     Errors are tangent Sampson errors in px, whatever the camera models. Keypoints without a ray are never inliers.
 
+    Args:
+        quality: (N,) larger for pairs that are more likely right (see `ransac`).
     Raises:
-        ValueError: the point sets differ in length.
+        ValueError: the point sets or the qualities differ in length.
     """
     check_lengths(points2D_1, points2D_2)
     return relative_pose_of_bearings(
-        Bearings.of(points2D_1, camera1), Bearings.of(points2D_2, camera2), config, rng=rng
+        Bearings.of(points2D_1, camera1), Bearings.of(points2D_2, camera2), config, rng=rng, quality=quality
     )
 
 
 def relative_pose_of_bearings(
-    bearings1: Bearings, bearings2: Bearings, config: RansacConfig = RansacConfig(), *, rng: np.random.Generator
+    bearings1: Bearings,
+    bearings2: Bearings,
+    config: RansacConfig = RansacConfig(),
+    *,
+    rng: np.random.Generator,
+    quality: Vector | None = None,
 ) -> RelativePoseEstimate | Rejected:
     """As `estimate_relative_pose`, for keypoints that have been turned into bearings."""
     problem, usable = essential_problem(bearings1, bearings2, config.max_error_px)
-    estimate = ransac(problem, config, rng)
+    estimate = ransac(problem, config, rng, chosen(quality, usable))
     if not isinstance(estimate, Estimate):
         return estimate
     inliers = scatter(estimate.inliers, usable)
-    pose, front = pose_from_essential(estimate.model.reshape(3, 3), bearings1.rays[inliers], bearings2.rays[inliers])
+    pose, front = pose_from_essential(
+        estimate.model[:9].reshape(3, 3), bearings1.rays[inliers], bearings2.rays[inliers]
+    )
     essential = essential_from_pose(pose)
     return RelativePoseEstimate(pose, essential, inliers, scatter(front, inliers), estimate.iterations)
 
@@ -140,15 +163,25 @@ def refine_relative_pose(
         raise ValueError("a pose without translation has no essential matrix")
     bearings1, bearings2 = Bearings.of(points2D_1, camera1), Bearings.of(points2D_2, camera2)
     problem, _ = essential_problem(bearings1, bearings2, max_error_px)
-    start = np.concatenate([cam2_from_cam1.rotation.matrix.ravel(), cam2_from_cam1.translation / length])
-    state = polish(problem, start)
-    return Rigid3.from_matrix(np.concatenate([state[:9].reshape(3, 3), state[9:, None]], 1))
+    model, _ = polish(problem, flat(essential_from_pose(cam2_from_cam1) / length))
+    poses = decompose_essential(model[:9].reshape(3, 3))
+    # The start tells which of the four poses of E is meant.
+    turns = (poses.rotation.inverse() @ cam2_from_cam1.rotation).angle
+    nearest = turns - 1e-9 * (poses.translation @ cam2_from_cam1.translation)
+    return poses[int(np.argmin(nearest))]
 
 
-def essential_problem(first: Bearings, second: Bearings, max_error_px: float) -> tuple[EssentialProblem, Mask]:
+def flat(matrix: Matrix3) -> FloatArray:
+    """The model of a matrix, by rows."""
+    model = np.zeros(SIZE)
+    model[:9] = matrix.ravel()
+    return model
+
+
+def essential_problem(first: Bearings, second: Bearings, max_error_px: float) -> tuple[CompiledProblem, Mask]:
     """The sampling problem of the pairs of which both keypoints have a ray, and which these are."""
     usable = first.valid & second.valid
-    problem = EssentialProblem.from_rays(
+    problem = essential_matrix(
         first.rays[usable], second.rays[usable], first.jacobians[usable], second.jacobians[usable], max_error_px
     )
     return problem, usable
