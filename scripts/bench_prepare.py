@@ -33,7 +33,7 @@ from sfm.verification import verify_pair
 FULL_WELL = 4000
 """Electrons of a white pixel at full exposure; three stops below it has an eighth."""
 READ_NOISE = 4.0
-FEATURES = FeatureConfig(max_features=6000)
+FEATURES = FeatureConfig(max_features=6000, min_features=0)
 LOWERED = FeatureConfig(max_features=6000, min_features=2000)
 
 
