@@ -16,8 +16,9 @@ matches were verified altogether (`scripts/bench_prepare.py`; "lowered" is `feat
     | noise of 6 %         |  2973 |  3851 |  2517 |  2865 |    3001 |      3843 |   3270 |    2973 |
     | specks, 2 %          |  4464 |  8735 |  6902 |  4355 |    4464 |      3429 |   8218 |    4464 |
 
-`auto` loses nothing on any of the pairs as they are, and at most 3 % on a spoilt one. A remedy for one fault harms where there is another or none,
-hence its thresholds. A thing before a black background is the hard case: dark, but not too dark.
+`auto` loses nothing on any of the pairs as they are, and at most 3 % on a spoilt one. A remedy for one fault harms
+where there is another or none, hence its thresholds. A thing before a black background is the hard case: dark, but
+not too dark.
 """
 
 from __future__ import annotations
