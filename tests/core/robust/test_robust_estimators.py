@@ -143,6 +143,21 @@ def test_fundamental_matrix_is_recovered_among_half_outliers(seed):
     assert singular[2] < 1e-12 * singular[0]
 
 
+def test_fundamental_matrix_of_a_scene_with_a_dominant_plane_explains_what_lies_off_it():
+    explained = []
+    for seed in range(10):
+        p1, p2, pose, wrong = _two_views(PINHOLE, count=400, outliers=0.3, seed=seed, plane=True)
+        rng = _rng(seed)
+        points = rng.uniform(-1, 1, (30, 3)) * [2.5, 2, 1.5] + [0, 0, 5]
+        off1, off2 = PINHOLE.project(points)[0], PINHOLE.project(pose @ points)[0]
+        off1, off2 = (p + rng.normal(size=p.shape) * 0.5 for p in (off1, off2))
+        found = estimate_fundamental(np.concatenate([p1, off1]), np.concatenate([p2, off2]), rng=_rng(seed))
+        assert found.inliers[wrong:400].mean() > 0.97
+        explained.append(found.inliers[400:].mean())
+    assert np.mean(explained) > 0.95
+    assert min(explained) > 0.85
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_homography_is_recovered_among_half_outliers_with_the_sign_of_visible_points(seed):
     rng = _rng(seed)
