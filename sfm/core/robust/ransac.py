@@ -36,7 +36,7 @@ from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 from sfm.core.robust._two_view_kernels import TwoViews
 
-_BATCH = 50
+_BATCH = 20
 _SCALE = 1.5
 _LOCAL_TOLERANCE, _FINAL_TOLERANCE = 1e-4, 1e-6
 

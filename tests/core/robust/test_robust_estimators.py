@@ -84,6 +84,32 @@ def test_relative_pose_is_recovered_among_half_outliers_for_every_kind_of_camera
     assert np.linalg.norm(found.cam2_from_cam1.translation) == pytest.approx(1)
 
 
+def test_the_marginalised_score_asks_no_knowledge_of_the_noise():
+    errors = {"truncated": [], "marginalized": []}
+    for seed in range(10):
+        p1, p2, pose, _ = _two_views(PINHOLE, seed=seed, noise=0.3)
+        for score, found in errors.items():
+            config = RansacConfig(max_error_px=20.0, score=score)
+            estimate = estimate_relative_pose(p1, p2, PINHOLE, PINHOLE, config, rng=_rng())
+            found.append(_direction_deg(estimate.cam2_from_cam1, pose))
+    assert max(errors["marginalized"]) < 1.5
+    assert np.median(errors["marginalized"]) <= 1.05 * np.median(errors["truncated"])
+
+
+@pytest.mark.parametrize("estimator", ["relative", "fundamental", "homography"])
+def test_matches_in_any_order_of_quality_give_the_mask_of_their_own_rows(estimator):
+    p1, p2, _, wrong = _two_views(PINHOLE, outliers=0.4, plane=estimator == "homography")
+    quality = _rng(2).uniform(size=len(p1))
+    run = {
+        "relative": lambda: estimate_relative_pose(p1, p2, PINHOLE, PINHOLE, rng=_rng(), quality=quality),
+        "fundamental": lambda: estimate_fundamental(p1, p2, rng=_rng(), quality=quality),
+        "homography": lambda: estimate_homography(p1, p2, rng=_rng(), quality=quality),
+    }
+    inliers = run[estimator]().inliers
+    assert inliers[wrong:].mean() > 0.95
+    assert inliers[:wrong].mean() < 0.12
+
+
 def test_relative_pose_between_different_cameras_and_on_the_sphere():
     rng = _rng(5)
     points = rng.normal(size=(200, 3)) * 4
@@ -141,6 +167,21 @@ def test_fundamental_matrix_is_recovered_among_half_outliers(seed):
     assert found.inliers[:wrong].mean() < 0.1
     singular = np.linalg.svd(found.matrix)[1]
     assert singular[2] < 1e-12 * singular[0]
+
+
+def test_fundamental_matrix_of_a_scene_with_a_dominant_plane_explains_what_lies_off_it():
+    explained = []
+    for seed in range(10):
+        p1, p2, pose, wrong = _two_views(PINHOLE, count=400, outliers=0.3, seed=seed, plane=True)
+        rng = _rng(seed)
+        points = rng.uniform(-1, 1, (30, 3)) * [2.5, 2, 1.5] + [0, 0, 5]
+        off1, off2 = PINHOLE.project(points)[0], PINHOLE.project(pose @ points)[0]
+        off1, off2 = (p + rng.normal(size=p.shape) * 0.5 for p in (off1, off2))
+        found = estimate_fundamental(np.concatenate([p1, off1]), np.concatenate([p2, off2]), rng=_rng(seed))
+        assert found.inliers[wrong:400].mean() > 0.97
+        explained.append(found.inliers[400:].mean())
+    assert np.mean(explained) > 0.95
+    assert min(explained) > 0.85
 
 
 @pytest.mark.parametrize("seed", range(3))
