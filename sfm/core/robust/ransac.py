@@ -162,7 +162,8 @@ def ransac(
     best = best_minimal = problem.count * problem.max_error**2
     # As long as no model has enough inliers, sampling ends when one would have been found.
     hopeful = dataclasses.replace(config, trials_factor=1.0)
-    drawn, limit, reach = 0, required_iterations(needed, problem.count, problem.sample_size, hopeful), problem.count
+    hopeless = required_iterations(needed, problem.count, problem.sample_size, hopeful)
+    drawn, limit, reach = 0, hopeless, problem.count
     model = None
     while drawn < limit:
         samples = np.empty((min(_BATCH, limit - drawn), problem.sample_size), np.int64)
@@ -181,6 +182,9 @@ def ransac(
         if index < 0:
             continue
         best, model = score, candidate
+        if inliers < needed:
+            limit = hopeless
+            continue
         limit = required_iterations(inliers, problem.count, problem.sample_size, config)
         if order is not None:
             squares = searched.squared_errors(model)

@@ -265,11 +265,16 @@ def test_matches_in_the_order_of_their_quality_need_fewer_samples():
         assert found.inliers[wrong[order]].mean() < 0.05
 
 
-def test_sampling_ends_early_where_too_few_inliers_for_a_model_would_have_been_found():
+def test_sampling_ends_where_a_model_with_enough_inliers_would_have_been_found():
     rng = np.random.default_rng(6)
-    problem = homography_matrix(rng.normal(size=(4, 30)), 0.01)
+    problem = homography_matrix(rng.normal(size=(4, 30)), 0.3)
+    drawn = []
+    best = problem.best
+    problem.best = lambda models, *rest: drawn.append(len(models)) or best(models, *rest)
     found = ransac(problem, RansacConfig(), rng)
     assert isinstance(found, Rejected)
+    # 15 of 30 inliers: log(0.0001) / log(1 − 1365 / 27405) = 181 draws, not the 10,000 that few inliers ask for.
+    assert sum(drawn) < 250
 
 
 def test_too_few_data_are_rejected_with_numbers():
