@@ -32,7 +32,7 @@ import cv2
 import numpy as np
 import scipy.io
 
-from scripts.bench_frontend import MIN_AGREEING, features_of
+from scripts.bench_pairs import features_of
 from scripts.bench_sfm import SETS, environment
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -52,6 +52,7 @@ from sfm.core.scene import Reconstruction
 from sfm.evaluation.accuracy import area_under_recall
 from sfm.matching import SearchableFeatures, match_features
 
+MIN_AGREEING = 30
 POSE_SETS = ("fountain-P11", "Herz-Jesus-P8")
 AGREE_PX, SEEDS = 4.0, 5
 Pose = tuple[np.ndarray, np.ndarray]
