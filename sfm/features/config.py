@@ -56,10 +56,10 @@ class FeatureConfig:
     """Scales in an octave. Lowe's value."""
 
     first_octave: Literal["auto", "doubled", "full"] = "auto"
-    """The image that the first octave is: the image itself (full), at twice its size (doubled), or enlarged to
-    3,200 px but no more than twice (auto). Most features of small photos are found by the enlargement. Large ones do
-    not need it: the eight of Herz-Jesus-P8 give relative poses of AUC 92.0 at 1° at their 3,072 px and 88.6 when
-    reduced to 1,600 and doubled again, in the same time."""
+    """The image that the search begins with: itself (full), at twice its size (doubled), or doubled if its longest
+    side has up to 2,000 px (auto). Most features of small photos are found by the doubling. Large ones do not need it:
+    the eight of Herz-Jesus-P8 give relative poses of AUC 92.0 at 1° at their 3,072 px and 88.6 when reduced to 1,600
+    and doubled again, in the same time."""
 
     upright: bool = False
     """All orientations are zero: for cameras that were never turned about their axis. Rotations beyond some 15° are

@@ -35,10 +35,8 @@ _PLACES_A_PIXEL = 0.05
 """Extrema expected at most; more are looked for again with more room."""
 _PEAKS = 4
 """Orientations of one place at most."""
-_FIRST_OCTAVE_PX = 3200
-"""Longest side of the first octave where that is left to us; smaller images are at most doubled."""
-_HARDLY_LARGER = 1.25
-"""Enlargements below this add blur but no keypoints."""
+_DOUBLED_UP_TO_PX = 2000
+"""Longest side of images that are doubled when that is left to us."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -61,16 +59,15 @@ def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: S
     `select` is asked about places. Of their orientations, of which a place may have several, the `max_features` of
     the strongest places are kept.
     """
-    layers = config.octave_layers
-    stacks = list(octaves(grey, layers, enlargement_of(max(grey.shape), config)))
+    layers, doubled = config.octave_layers, is_doubled(max(grey.shape), config)
+    stacks = list(octaves(grey, layers, doubled=doubled))
     extrema = _extrema(stacks, config)
 
     def keypoints_of(some: _Extrema, angles: FloatArray) -> Keypoints:
-        first_from_grey = np.array(stacks[0].shape[:0:-1]) / grey.shape[::-1] if stacks else np.ones(2)
-        pixels = 2.0**some.octaves
+        pixels = 2.0**some.octaves / (2 if doubled else 1)
         return Keypoints(
-            (some.columns[:, :2] * pixels[:, None] + 0.5) / first_from_grey,
-            (blur_of(some.columns[:, 2], layers) * pixels / first_from_grey.mean()).astype(np.float32),
+            some.columns[:, :2] * pixels[:, None] + 0.5,
+            (blur_of(some.columns[:, 2], layers) * pixels).astype(np.float32),
             angles.astype(np.float32),
             some.columns[:, 3].astype(np.float32),
         )
@@ -85,12 +82,11 @@ def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: S
     return keypoints[kept], _descriptors(stacks, extrema[rows[kept]], angles[kept], layers)
 
 
-def enlargement_of(longest_side: int | float, config: FeatureConfig) -> float:
-    """The first octave's size by that of the image, 1 to 2."""
+def is_doubled(longest_side: int | float, config: FeatureConfig) -> bool:
+    """Whether the first octave is the image at twice its size."""
     if config.first_octave != "auto":
-        return 2.0 if config.first_octave == "doubled" else 1.0
-    factor = min(2.0, _FIRST_OCTAVE_PX / longest_side)
-    return factor if factor >= _HARDLY_LARGER else 1.0
+        return config.first_octave == "doubled"
+    return longest_side <= _DOUBLED_UP_TO_PX
 
 
 def sift_memory_bytes(width: float, height: float, config: FeatureConfig) -> int:
@@ -99,7 +95,7 @@ def sift_memory_bytes(width: float, height: float, config: FeatureConfig) -> int
     It holds `octave_layers` + 3 blurred copies of the first octave in float32, and two more while it makes them; all
     octaves together take 4/3 of the first.
     """
-    pixels = width * height * enlargement_of(max(width, height), config) ** 2
+    pixels = width * height * (4 if is_doubled(max(width, height), config) else 1)
     return int(pixels * 4 * (config.octave_layers + 5) * 4 / 3)
 
 

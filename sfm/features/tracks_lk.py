@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from sfm.core.arrays import BoolArray, ImageU8
+from sfm.core.arrays import BoolArray
 from sfm.core.errors import ConfigError
 from sfm.core.scene import DescriptorKind, Features, Matches
 
@@ -70,12 +70,12 @@ class TrackedFrame:
 
 
 def track_features(
-    frames: Iterable[ImageU8], config: TrackingConfig = TrackingConfig(), mask: BoolArray | None = None
+    frames: Iterable[np.ndarray], config: TrackingConfig = TrackingConfig(), mask: BoolArray | None = None
 ) -> Iterator[TrackedFrame]:
     """Features of each frame as it comes, with its matches; the columns of the matches are (previous, this frame).
 
     Args:
-        frames: grey or RGB, of one size.
+        frames: grey (H, W) or RGB (H, W, 3), uint8, of one size.
         mask: (H, W), the same for all frames; corners are kept where it is True.
     Raises:
         ValueError: a frame or the mask is of another size.

@@ -24,7 +24,7 @@ def noise(seed: int, height: int = 90, width: int = 121) -> np.ndarray:
 
 
 def stack_of(seed: int) -> np.ndarray:
-    return next(octaves(noise(seed), 3, 1.0))
+    return next(octaves(noise(seed), 3, doubled=False))
 
 
 def extrema_twin(stack: np.ndarray, threshold: float) -> set[tuple[int, int, int]]:
@@ -151,7 +151,7 @@ def test_descriptors_are_histograms_of_gradients_in_the_frame_of_the_keypoint():
 
 
 def test_keypoints_and_descriptors_are_those_of_opencv():
-    """From the second octave on, most of them: how the image is enlarged decides about many of the faint ones."""
+    """But for some near the threshold of contrast, which theirs compares in another place."""
     image = noise(3, 480, 640)
     ours = extract_features(image, FeatureConfig())
     assert isinstance(ours, Features)
@@ -165,7 +165,7 @@ def test_keypoints_and_descriptors_are_those_of_opencv():
     same = (gaps < 0.5) & (turns < 0.1)
     coarse = ours.scales > 2.4
     assert coarse.sum() > 300
-    assert same[coarse].any(axis=1).mean() > 0.7
+    assert same[coarse].any(axis=1).mean() > 0.85
     rows = np.flatnonzero(same.any(axis=1))
     a = ours.descriptors[rows].astype(np.float64) ** 2
     b = histograms[same[rows].argmax(axis=1)].astype(np.float64)
