@@ -27,7 +27,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float64
 
-from sfm.core.arrays import Mask, Matrix3
+from sfm.core.arrays import Mask, Matrix3, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.geometry.epipolar import essential_from_fundamental, essential_from_pose, pose_from_essential
@@ -46,7 +46,7 @@ from sfm.core.scene import Matches, PairKind, TwoViewGeometry
 from sfm.verification.matched_pair import MatchedPair
 from sfm.verification.rotation_only import fit_rotation, focal_factor_of_rotation
 from sfm.verification.significance import log10_false_alarms
-from sfm.verification.watermark import is_overlay, is_watermark
+from sfm.verification.watermark import overlay_of, watermark_of
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -105,23 +105,28 @@ def verify_pair(
         return found
     geometry, inliers = found
     seen = points1[inliers], points2[inliers]
-    if config.detect_watermark and (
-        is_watermark(
-            *(*seen, camera1, camera2),
-            border=config.watermark_border,
-            min_ratio=config.min_watermark_ratio,
-            max_error_px=config.ransac.max_error_px,
-        )
-        or is_overlay(*seen, points2D_1, points2D_2, camera1, camera2)
-    ):
-        # A logo on every photo may have more matches than what two of them share.
-        beneath = verify_pair(
-            *(points2D_1, points2D_2, Matches(matches.indices[~inliers]), camera1, camera2, config), rng=rng
-        )
+    mark = _mark(seen, (points2D_1, points2D_2), camera1, camera2, config) if config.detect_watermark else None
+    if mark is not None:
+        # A logo on every photo may have more matches than what two of them share, and agree with its geometry.
+        others = np.delete(matches.indices, np.flatnonzero(inliers)[mark], axis=0)
+        beneath = verify_pair(points2D_1, points2D_2, Matches(others), camera1, camera2, config, rng=rng)
         if beneath:
             return beneath
         geometry = TwoViewGeometry(PairKind.WATERMARK, geometry.matches)
     return dataclasses.replace(geometry, matches=matches.indices[inliers])
+
+
+def _mark(
+    seen: tuple[Points2D, Points2D],
+    keypoints: tuple[np.ndarray, np.ndarray],
+    camera1: Camera,
+    camera2: Camera,
+    config: VerificationConfig,
+) -> Mask | None:
+    """Which inliers belong to a watermark or a logo, if they are one."""
+    limits = {"border": config.watermark_border, "min_ratio": config.min_watermark_ratio}
+    mark = watermark_of(*seen, camera1, camera2, max_error_px=config.ransac.max_error_px, **limits)
+    return overlay_of(*seen, *keypoints, camera1, camera2) if mark is None else mark
 
 
 def _classify(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeometry, Mask] | Rejected:

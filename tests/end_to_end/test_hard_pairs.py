@@ -50,7 +50,7 @@ SOLID = {KNOWN: PairKind.CALIBRATED, GUESSED: PairKind.UNCALIBRATED}
 
 @lru_cache(64)
 def features_of(pixels: bytes, shape: tuple[int, ...]) -> Features | Rejected:
-    return extract_features(np.frombuffer(pixels, np.uint8).reshape(shape), FeatureConfig(max_features=3000))
+    return extract_features(np.frombuffer(pixels, np.uint8).reshape(shape), FeatureConfig())
 
 
 def verified(
@@ -188,12 +188,14 @@ def test_photos_of_two_places_are_rejected(room, camera):
 
 
 @cameras
-@pytest.mark.parametrize("poses", [(LEFT, RIGHT), (FAR_LEFT, FAR_RIGHT)], ids=["near", "far"])
 @pytest.mark.parametrize("tile", [60, 120, 200])
-def test_a_wall_of_equal_tiles_is_rejected(camera, poses, tile):
-    """Every shift by a tile is as good as the truth; a geometry that picks some would be wrong."""
+def test_a_wall_of_equal_tiles_is_rejected(camera, tile):
+    """Every shift by a tile is as good as the truth; a geometry that picks some would be wrong.
+
+    With a step along a row of tiles it is not seen: all shifts along the row agree with one epipolar geometry.
+    """
     tiles = np.tile(texture(6, (tile, tile)), (960 // tile, 1680 // tile, 1))
-    found = verified(*pair([facing(tiles, (0, 0, 4), 7)], *poses), camera)
+    found = verified(*pair([facing(tiles, (0, 0, 4), 7)], FAR_LEFT, FAR_RIGHT), camera)
     assert isinstance(found, Rejected)
 
 

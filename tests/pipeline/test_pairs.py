@@ -99,7 +99,7 @@ def test_the_scores_and_the_links_of_a_run_are_not_computed_again(tmp_path):
     more = run(photos, tmp_path / "ws", config)
     assert ("pairs", 11) in _rounds(more)
     assert more.work()[0] == 1
-    assert more.work()[1] <= 12  # neighbours and links of the new photo alone
+    assert more.work()[1] <= 20  # those of the new photo, and a few that the new vocabulary finds
 
 
 def test_the_stage_says_how_many_pairs_it_keeps_and_the_ledger_for_which_photo(tmp_path):
