@@ -1,7 +1,7 @@
 """ORB, AKAZE and BRISK: keypoints at several scales with descriptors of bits.
 
 Each has its own way of losing half a pixel in a pyramid. What comes out of here is free of it: a photo turned by 180°
-gives the turned keypoints (median difference 0.00 px for all three; up to 1.5 px for OpenCV's own coordinates of ORB).
+gives the turned keypoints (median difference 0.00 px for all three; up to 0.8 px for OpenCV's own coordinates of ORB).
 
 Reference:
     Rublee et al., ORB, ICCV 2011.

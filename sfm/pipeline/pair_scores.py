@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm.core.errors import ConfigError
 from sfm.core.events import ImageCompared, StageFinished, StageStarted
+from sfm.core.scene import DescriptorKind
 from sfm.pipeline.keys import code_digest, key_of
 from sfm.pipeline.stages import Run
 from sfm.retrieval import PairScores, probe_scores, probes_of, promising_pairs, similar_images
@@ -24,7 +25,6 @@ from sfm.retrieval.aggregation import aggregated_partners
 
 STAGE = "pairs"
 _NOTE = "pair_scores"
-_SIFT_DIMENSIONS = 128
 
 
 def scores_of(run: Run, feature_keys: Mapping[int, str], ids: Sequence[int]) -> PairScores:
@@ -47,7 +47,7 @@ def scores_of(run: Run, feature_keys: Mapping[int, str], ids: Sequence[int]) -> 
 
 def has_visual_words(run: Run, ids: Sequence[int]) -> bool:
     """Whether the descriptors are such that a vocabulary can be made of them."""
-    return run.database.read_features(ids[0]).descriptors.shape[1] == _SIFT_DIMENSIONS
+    return run.database.read_features(ids[0]).kind == DescriptorKind.SIFT
 
 
 def _computed(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from sfm.core.execution import ordered_map
-from sfm.core.scene import Features
+from sfm.core.scene import DescriptorKind, Features
 from sfm.retrieval import _kernels
 from sfm.retrieval.config import RetrievalConfig
 from sfm.retrieval.pairs import Pair
@@ -22,20 +22,20 @@ from sfm.retrieval.scores import PairScores
 
 _IMAGES_AT_ONCE = 32
 """Images whose probes meet those of one in one product: 11 MB of distances."""
-_SIFT_DIMENSIONS = 128
 
 
 def probes_of(features: Features, config: RetrievalConfig = RetrievalConfig()) -> UInt8[np.ndarray, "P D"]:
     """Descriptors of the features of largest scale; those of binary detectors with a number for each bit."""
     descriptors = largest(features, config.probes).descriptors
-    return descriptors if descriptors.shape[1] == _SIFT_DIMENSIONS else np.unpackbits(descriptors, axis=1)
+    return np.unpackbits(descriptors, axis=1) if features.kind == DescriptorKind.BINARY else descriptors
 
 
 def largest(features: Features, count: int) -> Features:
     """The `count` features of largest scale, in their order."""
     rows = np.sort(np.argsort(-features.scales, kind="stable")[:count])
     return Features(
-        features.points2D[rows], features.scales[rows], features.orientations[rows], features.descriptors[rows]
+        *(features.points2D[rows], features.scales[rows], features.orientations[rows], features.descriptors[rows]),
+        kind=features.kind,
     )
 
 

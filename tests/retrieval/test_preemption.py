@@ -1,9 +1,12 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from sfm.core.errors import ConfigError
+from sfm.core.scene import DescriptorKind
 from sfm.matching import MatchingConfig, match_features
 from sfm.retrieval import RetrievalConfig, exhaustive_pairs, probe_scores, probes_of
 from tests.retrieval.made_up import features_of, walk
@@ -46,7 +49,8 @@ def test_probes_are_the_features_of_largest_scale():
 
 def test_squared_distances_of_binary_probes_are_the_bits_that_differ():
     rows = np.random.default_rng(3).integers(0, 256, (2, 32), dtype=np.uint8)
-    bits = probes_of(features_of(rows)).astype(int)
+    features = dataclasses.replace(features_of(rows), kind=DescriptorKind.BINARY)
+    bits = probes_of(features).astype(int)
     assert bits.shape == (2, 256)
     assert np.sum((bits[0] - bits[1]) ** 2) == sum(int(a ^ b).bit_count() for a, b in zip(*rows.tolist(), strict=True))
 
