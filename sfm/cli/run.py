@@ -29,7 +29,7 @@ def _arg(metavar: str, default: str = "", **options: Any) -> Any:
 class SettingOptions:
     """The settings that have an option of their own, the same for all commands that compute in a workspace."""
 
-    max_image_size: Annotated[int | None, _arg("PX", "1600")] = None
+    max_image_size: Annotated[int | None, _arg("PX", "3200")] = None
     """Longest side to which larger photos are reduced when features are sought; 0 for full size."""
 
     features: Annotated[str | None, _arg("NAME", "sift")] = None
@@ -133,6 +133,8 @@ def configured(options: SettingOptions, workspace: Path) -> tuple[Any, str]:
     config, note = PipelineConfig(), ""
     path = workspace / "sfm.toml"
     given = dict(parsed_setting(text) for text in options.set) | dict(_shortcuts(options))
+    # The next command may be called from another folder.
+    given |= {k: str(Path(v).absolute()) for k in _PATHS if (v := given.get(k)) and v != "none"}
     if path.is_file():
         defaults = dict(flattened(config))
         config = read_toml(path, config)
@@ -141,6 +143,9 @@ def configured(options: SettingOptions, workspace: Path) -> tuple[Any, str]:
             told = ", ".join(f"{key} = {value!r}" for key, value in kept.items())
             note = f"settings from {path}: {told}"
     return with_settings(config, given, "command line"), note
+
+
+_PATHS = ("masks", "cameras.intrinsics", "retrieval.pair_list", "features.model", "matching.lightglue")
 
 
 def _shortcuts(options: SettingOptions) -> Iterator[tuple[str, Any]]:

@@ -19,7 +19,7 @@ from sfm.core.errors import Rejected
 from sfm.core.scene import DescriptorKind, Features
 from sfm.features.affine import detect_in_views
 from sfm.features.binary import detect_akaze, detect_brisk, detect_orb
-from sfm.features.config import SMALLEST_SIDE_PX, FeatureConfig
+from sfm.features.config import NETWORKS, SMALLEST_SIDE_PX, FeatureConfig
 from sfm.features.corners import detect_corners
 from sfm.features.keypoints import Described, Selection, as_features
 from sfm.features.learned import detect_learned
@@ -30,6 +30,8 @@ _LOWERED_AT_MOST = 3
 """Times that the contrast is halved for an image with few features; below an eighth there is only noise."""
 
 _ALL = 1_000_000
+_BYTES_A_PIXEL = {"akaze": 160, "aliked": 1500, "disk": 1500}
+"""AKAZE keeps some forty images of float32, networks some hundred channels."""
 
 Preparation: TypeAlias = Callable[[np.ndarray], np.ndarray]
 """What is done to the reduced grey image before features are sought."""
@@ -94,8 +96,9 @@ def extract(
     select = Selector(config, (reduced.shape[1], reduced.shape[0]), mask, full_from_reduced)
     wanted, last = prepare(reduced) if prepare else reduced, config
     keypoints, descriptors = detect(wanted, config, select)
+    enough = min(config.min_features, config.max_features)
     for lowered in _lowered(config):
-        if len(keypoints) >= config.min_features or select.found == select.masked > 0:
+        if len(keypoints) >= enough or select.found == select.masked > 0:
             break
         last = lowered
         keypoints, descriptors = detect(wanted, lowered, select)
@@ -151,12 +154,19 @@ def descriptor_kind(config: FeatureConfig) -> DescriptorKind:
 
 
 def working_memory_bytes(width: int, height: int, config: FeatureConfig) -> int:
-    """Memory that `extract_features` takes for one image while it works; the others need less than SIFT."""
+    """Memory that `extract_features` takes for one image while it works; but for SIFT, a cautious estimate."""
     factor = min(1.0, config.max_image_size / max(width, height)) if config.max_image_size else 1.0
-    return sift_memory_bytes(width * factor, height * factor, config)
+    if config.kind == "sift":
+        # A simulated view is narrower than the image, and may be doubled where the image is not.
+        views = dataclasses.replace(config, first_octave="doubled") if config.affine_tilts else config
+        return sift_memory_bytes(width * factor, height * factor, views)
+    return int(_BYTES_A_PIXEL.get(config.kind, 40) * width * height * factor**2)
 
 
 def _lowered(config: FeatureConfig) -> Iterator[FeatureConfig]:
+    """With less and less contrast; networks know no contrast."""
+    if config.kind in NETWORKS:
+        return
     for k in range(1, _LOWERED_AT_MOST + 1):
         yield dataclasses.replace(config, contrast_threshold=config.contrast_threshold / 2**k)
 

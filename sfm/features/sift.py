@@ -78,7 +78,7 @@ def detect_sift(grey: UInt8[np.ndarray, "H W"], config: FeatureConfig, select: S
     else:
         rows, angles = _oriented(stacks, extrema, layers)
     keypoints = keypoints_of(extrema[rows], angles)
-    kept = strongest(keypoints, config.max_features)
+    kept = _of_each_place_first(rows, keypoints, config)
     return keypoints[kept], _descriptors(stacks, extrema[rows[kept]], angles[kept], layers)
 
 
@@ -97,6 +97,14 @@ def sift_memory_bytes(width: float, height: float, config: FeatureConfig) -> int
     """
     pixels = width * height * (4 if is_doubled(max(width, height), config) else 1)
     return int(pixels * 4 * (config.octave_layers + 5) * 4 / 3)
+
+
+def _of_each_place_first(rows: np.ndarray, keypoints: Keypoints, config: FeatureConfig) -> np.ndarray:
+    """`max_features` of the keypoints; an even spreading gives up second orientations before it gives up places."""
+    if config.spreading == "strongest":
+        return strongest(keypoints, config.max_features)
+    number = np.arange(len(rows)) - np.searchsorted(rows, rows)
+    return np.sort(np.lexsort((-keypoints.responses, number))[: config.max_features])
 
 
 def _extrema(stacks: list[np.ndarray], config: FeatureConfig) -> _Extrema:

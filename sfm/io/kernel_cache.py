@@ -38,12 +38,14 @@ def use_kernel_cache() -> Path:
 
 
 def kernel_hash() -> str:
-    """A short name for all kernel sources together with the versions of Python, numba and llvmlite."""
+    """A short name for all kernel sources and their place, with the versions of Python, numba and llvmlite."""
     digest = hashlib.blake2b(digest_size=8)
     digest.update(" ".join([sys.version, *(_version(name) for name in ("numba", "llvmlite", "numpy"))]).encode())
     for package in _PACKAGES:
         spec = importlib.util.find_spec(package)
         for root in (spec.submodule_search_locations or []) if spec else []:
+            # numba finds compiled code by the path of its source: that of another copy is of no use here.
+            digest.update(os.path.realpath(root).encode())
             for path in sorted(Path(root).rglob("*_kernels.py")):
                 digest.update(path.relative_to(root).as_posix().encode())
                 digest.update(path.read_bytes())

@@ -55,10 +55,12 @@ def photos_among(names: Iterable[str], images: Path, folder: Path | None) -> tup
     if folder.resolve() == images.resolve():
         masks = {path.relative_to(folder).as_posix() for path in _masks_among(names, folder).values()}
         return tuple(name for name in names if name not in masks)
-    if not folder.resolve().is_relative_to(images.resolve()):
-        return names
-    within = folder.resolve().relative_to(images.resolve()).as_posix()
-    return tuple(name for name in names if not name.startswith(f"{within}/"))
+    # A link in the folder of the photos counts as lying there, and so does what a link from elsewhere leads to.
+    for inner, outer in ((folder.absolute(), images.absolute()), (folder.resolve(), images.resolve())):
+        if inner.is_relative_to(outer):
+            within = inner.relative_to(outer).as_posix()
+            names = tuple(name for name in names if not name.startswith(f"{within}/"))
+    return names
 
 
 def find_masks(names: Sequence[str], images: Path, folder: Path) -> dict[str, Path]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
+from sfm.core.cameras.undistortion import pinhole_pixels
 from sfm.core.geometry.epipolar import ray_jacobians
 from sfm.core.geometry.homogeneous import to_homogeneous
 from sfm.core.scene import DescriptorKind, Features, Matches, TwoViewGeometry
@@ -31,7 +32,7 @@ def match_guided(
     """Matches of two images within `config.guided_error_px` of their geometry, sorted by the index in image 1.
 
     Ratio and distance are judged among the features that agree with the geometry: E where it has one, for any camera
-    (Sampson's distance by the derivatives of the rays), else H, else F in px.
+    (Sampson's distance by the derivatives of the rays), else H, else F in px of the images without distortion.
 
     Raises:
         ValueError: the geometry has no matrix, or the descriptors differ in kind or length.
@@ -44,10 +45,10 @@ def match_guided(
         (x1, J1), (x2, J2) = (_rays(f.points2D, c) for f, c in ((features1, camera1), (features2, camera2)))
         kernels.scan_epipolar(*tables, x1, x2, J1, J2, np.array(geometry.E), square, bits, found1, found2)
     elif geometry.H is not None:
-        x1, x2 = (np.ascontiguousarray(to_homogeneous(f.points2D)) for f in (features1, features2))
+        x1, x2 = (_pixels(f.points2D, c)[0] for f, c in ((features1, camera1), (features2, camera2)))
         kernels.scan_homography(*tables, x1, x2, np.array(geometry.H), square, bits, found1, found2)
     elif geometry.F is not None:
-        (x1, J1), (x2, J2) = (_pixels(f.points2D) for f in (features1, features2))
+        (x1, J1), (x2, J2) = (_pixels(f.points2D, c) for f, c in ((features1, camera1), (features2, camera2)))
         kernels.scan_epipolar(*tables, x1, x2, J1, J2, np.array(geometry.F), square, bits, found1, found2)
     else:
         raise ValueError(f"a {geometry.kind.name} geometry without a matrix guides nothing")
@@ -62,8 +63,10 @@ def _rays(points2D: Points2D, camera: Camera) -> tuple[FloatArray, FloatArray]:
     return np.ascontiguousarray(rays), np.ascontiguousarray(ray_jacobians(by_point))
 
 
-def _pixels(points2D: Points2D) -> tuple[FloatArray, FloatArray]:
-    """Homogeneous pixels and their derivatives."""
+def _pixels(points2D: Points2D, camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """Homogeneous pixels of the camera without its distortion, where F and H live, and their derivatives."""
+    if camera.model_info.extra_indices:
+        points2D = pinhole_pixels(*camera.unproject(points2D), camera)
     derivatives = np.zeros((len(points2D), 3, 2))
     derivatives[:, 0, 0] = derivatives[:, 1, 1] = 1
     return np.ascontiguousarray(to_homogeneous(points2D)), derivatives

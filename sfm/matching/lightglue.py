@@ -83,8 +83,13 @@ class LightGlue:
 
     def _told(self, outputs: list[np.ndarray], count1: int, count2: int) -> tuple[np.ndarray, FloatArray]:
         """Pairs (M, 2) and scores (M,)."""
-        pairs = next((o.reshape(-1, o.shape[-1]) for o in outputs if o.ndim >= 2 and o.shape[-1] == 2), None)
-        scores = None if pairs is None else next((o.reshape(-1) for o in outputs if o.size == len(pairs)), None)
+        # Two matches have two scores, which look like one match: names that tell come first.
+        told = sorted(zip(self._names, outputs, strict=True), key=lambda named: "score" in named[0])
+        tables = [(name, o) for name, o in told if o.ndim >= 2 and o.shape[-1] == 2]
+        chosen, table = tables[0] if tables else ("", None)
+        pairs = None if table is None else table.reshape(-1, 2)
+        others = [o for name, o in reversed(told) if name != chosen]
+        scores = None if pairs is None else next((o.reshape(-1) for o in others if o.size == len(pairs)), None)
         if pairs is None or scores is None:
             shapes = ", ".join(f"{n} {o.shape}" for n, o in zip(self._names, outputs, strict=True))
             raise ConfigError(f"the network answers with {shapes}", path=self._path, remedy=_REMEDY)

@@ -111,7 +111,10 @@ def _key(run: Run, pair_keys: Mapping[Pair, str]) -> str:
     code = code_digest("sfm.viewgraph", "sfm.mapping", "sfm.bundle", "sfm.core", "sfm.pipeline", "sfm.io")
     images = [[k, image.name, image.digest, image.camera_id, image.camera] for k, image in sorted(run.images.items())]
     pairs = [[*pair, key] for pair, key in sorted(pair_keys.items())]
-    return key_of(code, run.config.cycles, run.config.mapping, run.config.seed, refines_intrinsics(run), images, pairs)
+    given = bool(run.config.cameras.intrinsics)
+    return key_of(
+        code, run.config.cycles, run.config.mapping, run.config.seed, refines_intrinsics(run), given, images, pairs
+    )
 
 
 def _model_folders(folder: Path) -> list[Path]:

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from sfm.core.errors import ConfigError
 from sfm.core.events import ImageCompared, StageFinished, StageStarted
 from sfm.core.scene import DescriptorKind
 from sfm.pipeline.keys import code_digest, key_of
@@ -62,10 +61,6 @@ def _computed(
     if config.method != "look" and words and config.similarity == "votes":
         return similar_images(
             lambda k: run.database.read_features(ids[k]), len(ids), config, seed=seed, threads=threads, on_image=tell
-        )
-    if config.method not in ("look", "auto") and not words:
-        raise ConfigError(
-            f"the method {config.method} needs descriptors with visual words, such as SIFT's", remedy="use look"
         )
     known = _known(stored, keys)
     probes = [probes_of(run.database.read_features(image_id), config) for image_id in ids]

@@ -13,6 +13,8 @@ import numpy as np
 
 from sfm.core.errors import ConfigError
 from sfm.core.events import Note
+from sfm.core.scene import DescriptorKind
+from sfm.features import descriptor_kind
 from sfm.io.database import Decision
 from sfm.io.exif import read_image_info
 from sfm.io.images import natural_key
@@ -33,9 +35,12 @@ def check_pair_settings(run: Run) -> None:
 
     Raises:
         InputError: the file cannot be used.
-        ConfigError: the method is `list` and there is no file, or `spatial` and no photo has a position.
+        ConfigError: the method is `list` and there is no file, `spatial` and no photo has a position, or `vocabulary`
+            and the descriptors have no visual words.
     """
-    config = run.config.retrieval
+    config, kind = run.config.retrieval, run.config.features.kind
+    if config.method == "vocabulary" and descriptor_kind(run.config.features) != DescriptorKind.SIFT:
+        raise ConfigError(f"the descriptors of {kind} have no visual words", remedy="take --pairs look")
     if config.method == "list":
         _listed(run)
     elif config.method == "spatial" and not np.isfinite(_positions_m(run, list(run.images))).any():

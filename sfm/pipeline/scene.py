@@ -83,7 +83,15 @@ def read_scene(
     if skipped:
         observer(Note(message=f"skipped {_named(skipped)}", level="warning"))
     groups = _given_groups(photos, config) if config.intrinsics else _groups(photos, config, observer)
-    masks_of = _masks(photos, folder, masks_in, observer) if masks_in else {}
+    masks_of: dict[str, MaskFile] = {}
+    if masks_in:
+        try:
+            masks_of = _masks(photos, folder, masks_in, observer)
+        except InputError as error:
+            # A folder beside the photos that nobody has named may belong to something else.
+            if masks or masks_in.absolute().is_relative_to(folder.absolute()) or isinstance(error, ImageError):
+                raise
+            observer(Note(message=f"{masks_in} is left alone: {error.cause}", level="warning"))
     with database.transaction():
         images = _synchronize(database, photos, groups)
         database.clear_ledger(_STAGE)

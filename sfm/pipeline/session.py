@@ -25,7 +25,7 @@ from sfm.pipeline.lock import locked
 from sfm.pipeline.observers import LogFiles, watched
 from sfm.pipeline.pairs import check_pair_settings
 from sfm.pipeline.scene import Scene, read_scene
-from sfm.pipeline.stages import Run
+from sfm.pipeline.stages import Run, check_networks
 from sfm.pipeline.warm_up import compile_kernels
 
 DATABASE = "database.db"
@@ -79,6 +79,7 @@ def session(
     ):
         scene = read_scene(database, folder, config.cameras, threads=threads, observer=tell, masks=config.masks)
         run = Run(database, config, threads, tell, scene.images)
+        check_networks(config)
         check_pair_settings(run)
         database.set_meta(_FOLDER_NOTE, str(folder))
         # Only now: settings that do not fit the photos must not be kept for the next run.

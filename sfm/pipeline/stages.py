@@ -10,6 +10,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
 import cv2
@@ -21,7 +22,7 @@ from sfm.core.execution import ordered_map
 from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
 from sfm.features import NETWORKS, working_memory_bytes
 from sfm.io.database import Database
-from sfm.matching import LightGlue, SearchableFeatures, match_features, match_guided
+from sfm.matching import LightGlue, MatchingConfig, SearchableFeatures, match_features, match_guided
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.image_features import STAGE as FEATURES
 from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, model_digest
@@ -93,6 +94,20 @@ def extract_all(run: Run) -> dict[int, str]:
     return keys
 
 
+def check_networks(config: PipelineConfig) -> None:
+    """Finds out before the work begins whether the files of networks are there, and are for these features.
+
+    Raises:
+        ConfigError: they are not.
+    """
+    model_digest(config.features)
+    if config.matching.lightglue and config.features.kind not in NETWORKS:
+        cause = f"matching.lightglue needs features of a network, not {config.features.kind}"
+        raise ConfigError(cause, remedy="choose features.kind aliked or disk, or no matching.lightglue")
+    if config.matching.lightglue and not Path(config.matching.lightglue).is_file():
+        raise ConfigError("there is no such file", path=config.matching.lightglue)
+
+
 def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) -> dict[Pair, str]:
     """Putative matches of pairs i < j of images that have features; returns the key of each pair.
 
@@ -100,11 +115,11 @@ def match_all(run: Run, feature_keys: Mapping[int, str], pairs: Iterable[Pair]) 
         ConfigError: the file of LightGlue cannot be used, or the features are not those of a network.
     """
     stage, config = "matching", run.config.matching
+    check_networks(run.config)
     network = LightGlue(config.lightglue) if config.lightglue else None
-    if network and run.config.features.kind not in NETWORKS:
-        cause = f"matching.lightglue needs features of a network, not {run.config.features.kind}"
-        raise ConfigError(cause, remedy="choose features.kind aliked or disk, or no matching.lightglue")
-    basis = key_of(code_digest("sfm.matching", "sfm.core"), config, *([network.digest] if network else []))
+    # Guided matching is a part of verification, and has its settings in the keys there.
+    plain = dataclasses.replace(config, guided=False, guided_error_px=MatchingConfig().guided_error_px)
+    basis = key_of(code_digest("sfm.matching", "sfm.core"), plain, *([network.digest] if network else []))
     keys = {(i, j): key_of(basis, feature_keys[i], feature_keys[j]) for i, j in pairs}
     stale = _stale(run, stage, keys, present=run.database.matched_pairs())
     features = lru_cache(_CACHED_IMAGES)(lambda image_id: SearchableFeatures(run.database.read_features(image_id)))

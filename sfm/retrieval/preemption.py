@@ -31,8 +31,10 @@ def probes_of(features: Features, config: RetrievalConfig = RetrievalConfig()) -
 
 
 def largest(features: Features, count: int) -> Features:
-    """The `count` features of largest scale, in their order."""
-    rows = np.sort(np.argsort(-features.scales, kind="stable")[:count])
+    """The `count` features of largest scale, in their order; among equals from all over the image."""
+    # Features come in reading order: to take the first of equals would be to take the top of the image.
+    anywhere = np.random.default_rng(0).permutation(len(features))
+    rows = np.sort(np.lexsort((anywhere, -features.scales))[:count])
     return Features(
         *(features.points2D[rows], features.scales[rows], features.orientations[rows], features.descriptors[rows]),
         kind=features.kind,

@@ -9,6 +9,7 @@ import numpy as np
 
 from sfm.core.arrays import Mask, Matrix3, Points2D
 from sfm.core.cameras import Camera
+from sfm.core.cameras.undistortion import pinhole_pixels
 from sfm.core.errors import Rejected
 from sfm.core.geometry.homography import transfer_errors
 from sfm.core.geometry.rigid import Rigid3
@@ -100,8 +101,4 @@ def _ideal_points(points2D: Points2D, bearings: Bearings, camera: Camera) -> Poi
     """Pixels of the pinhole camera without the distortion; NaN where the keypoint has no ray in front."""
     if not camera.model_info.extra_indices:
         return points2D
-    rays, k = bearings.rays, camera.calibration_matrix
-    with np.errstate(invalid="ignore", divide="ignore"):
-        ideal = rays[:, :2] / rays[:, 2:] * [k[0, 0], k[1, 1]] + k[:2, 2]
-    ideal[~bearings.valid | ~(rays[:, 2] > 0)] = np.nan
-    return ideal
+    return pinhole_pixels(bearings.rays, bearings.valid, camera)

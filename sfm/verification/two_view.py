@@ -29,7 +29,7 @@ from jaxtyping import Float64
 
 from sfm.core.arrays import Mask, Matrix3, Points2D
 from sfm.core.cameras import Camera
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.geometry.epipolar import essential_from_fundamental, essential_from_pose, pose_from_essential
 from sfm.core.geometry.homography import decompose_homography
 from sfm.core.geometry.rigid import Rigid3
@@ -74,7 +74,12 @@ class VerificationConfig:
     watermark_border: float = 0.1
     """Width of the border in which watermarks are looked for, as a fraction of the image diagonal."""
     min_watermark_ratio: float = 0.7
-    """Fraction of the inliers that must lie in the border, and of these that must share one translation."""
+    """Fraction of the inliers that must lie in the border, and of all that must share one translation there."""
+
+    def __post_init__(self) -> None:
+        for name in ("min_calibrated_ratio", "max_homography_ratio", "min_rotation_ratio", "min_watermark_ratio"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name} must be in (0, 1], got {getattr(self, name)}")
 
 
 def verify_pair(
@@ -136,9 +141,9 @@ def _classify(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeo
         open_ = pair.perspective and found.reason == "no_model"
         return _by_homography_alone(pair, config, found) if open_ else found
     geometry, inliers = found
-    needed = max(config.min_inlier_ratio, config.ransac.min_inlier_ratio) * pair.count
-    if inliers.sum() < needed:
-        return Rejected("low_inlier_ratio", f"{inliers.sum() / pair.count:.2f}")
+    too_few = _too_few(inliers, pair, config)
+    if too_few:
+        return too_few
     homography = None
     if pair.perspective:
         enough = config.max_homography_ratio * inliers.sum()
@@ -147,13 +152,24 @@ def _classify(pair: MatchedPair, config: VerificationConfig) -> tuple[TwoViewGeo
             homography = estimate
             if estimate.inliers.sum() > inliers.sum():
                 inliers = estimate.inliers
-    sizes = int(inliers.sum()), pair.count, pair.camera1, pair.camera2
-    chance = log10_false_alarms(*sizes, config.ransac.max_error_px, planar=homography is not None)
-    if chance > config.max_log10_false_alarms:
-        return Rejected("maybe_by_chance", f"{inliers.sum()} of {pair.count} matches")
+    by_chance = _by_chance(inliers, pair, config, planar=homography is not None)
+    if by_chance:
+        return by_chance
     if homography is None and pair.perspective:
         return geometry, inliers
     return _without_parallax(pair, config, geometry, homography, inliers), inliers
+
+
+def _too_few(inliers: Mask, pair: MatchedPair, config: VerificationConfig) -> Rejected | None:
+    needed = max(config.min_inlier_ratio, config.ransac.min_inlier_ratio) * pair.count
+    return Rejected("low_inlier_ratio", f"{inliers.sum() / pair.count:.2f}") if inliers.sum() < needed else None
+
+
+def _by_chance(inliers: Mask, pair: MatchedPair, config: VerificationConfig, *, planar: bool) -> Rejected | None:
+    sizes = int(inliers.sum()), pair.count, pair.camera1, pair.camera2
+    if log10_false_alarms(*sizes, config.ransac.max_error_px, planar=planar) <= config.max_log10_false_alarms:
+        return None
+    return Rejected("maybe_by_chance", f"{inliers.sum()} of {pair.count} matches")
 
 
 def _by_homography_alone(
@@ -163,6 +179,9 @@ def _by_homography_alone(
     estimate = pair.homography(config.ransac)
     if isinstance(estimate, Rejected):
         return rejected
+    too_few = _too_few(estimate.inliers, pair, config) or _by_chance(estimate.inliers, pair, config, planar=True)
+    if too_few:
+        return too_few
     nothing = TwoViewGeometry(PairKind.PLANAR_OR_PANORAMIC, _NO_MATCHES)
     return _without_parallax(pair, config, nothing, estimate, estimate.inliers), estimate.inliers
 

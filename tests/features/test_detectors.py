@@ -11,7 +11,8 @@ import pytest
 
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.scene import DescriptorKind, Features
-from sfm.features import FeatureConfig, extract_features
+from sfm.features import FeatureConfig, extract, extract_features
+from sfm.features.extraction import Extraction
 from tests.features.rendering import blob_image, corner_image, errors_at, scattered, texture
 
 
@@ -228,6 +229,12 @@ def test_an_image_with_few_features_is_searched_again_with_less_contrast(kind):
     once = extract_features(flat, FeatureConfig(kind=kind, min_features=0))
     again = extract_features(flat, FeatureConfig(kind=kind, min_features=80))
     assert len(again) > max(60, 1.5 * (len(once) if isinstance(once, Features) else 0))
+
+
+def test_a_cap_below_the_wanted_number_is_no_lack_of_features():
+    found = extract(texture(14), FeatureConfig(max_features=50, min_features=500))
+    assert isinstance(found, Extraction)
+    assert found.contrast_threshold == FeatureConfig().contrast_threshold
 
 
 def test_features_of_tilted_views_match_a_wall_seen_from_aside():

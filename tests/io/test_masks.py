@@ -78,6 +78,14 @@ def test_masks_within_the_photos_are_no_photos(tmp_path):
     assert photos_among(names, tmp_path, tmp_path.parent) == names
 
 
+def test_a_link_to_masks_within_the_photos_holds_no_photos(tmp_path):
+    images, elsewhere = tmp_path / "photos", tmp_path / "elsewhere"
+    images.mkdir()
+    elsewhere.mkdir()
+    (images / "masks").symlink_to(elsewhere)
+    assert photos_among(["a.jpg", "masks/a.png"], images, images / "masks") == ("a.jpg",)
+
+
 def test_masks_beside_their_photos_are_told_by_their_name(tmp_path):
     names = ("a.jpg", "a.png", "a_mask.png", "b.jpg", "b.jpg.png", "c_mask.jpg")
     assert photos_among(names, tmp_path, tmp_path) == ("a.jpg", "a.png", "b.jpg", "c_mask.jpg")

@@ -47,6 +47,16 @@ def test_probes_are_the_features_of_largest_scale():
     assert len(probes_of(features_of(descriptors, scales), RetrievalConfig(probes=100))) == 50
 
 
+def test_probes_of_one_scale_come_from_all_over_the_image():
+    rows = np.arange(1000)
+    descriptors = np.zeros((1000, 128), np.uint8)
+    descriptors[:, 0], descriptors[:, 1] = rows // 256, rows % 256
+    probes = probes_of(features_of(descriptors, np.ones(1000)), RetrievalConfig(probes=100)).astype(int)
+    numbers = 256 * probes[:, 0] + probes[:, 1]
+    assert len(numbers) == 100
+    assert np.histogram(numbers, bins=5, range=(0, 1000))[0].min() >= 10
+
+
 def test_squared_distances_of_binary_probes_are_the_bits_that_differ():
     rows = np.random.default_rng(3).integers(0, 256, (2, 32), dtype=np.uint8)
     features = dataclasses.replace(features_of(rows), kind=DescriptorKind.BINARY)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.core.cameras import Camera
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -212,3 +212,10 @@ def test_a_homography_of_undistorted_pixels_maps_them():
     ideal1, ideal2 = (transform_points(k, rays[:, :2] / rays[:, 2:]) for rays in (rays1, rays2))
     i, j = matches.indices.T
     assert np.abs(transform_points(found.H, ideal1[i]) - ideal2[j]).max() < 1e-4
+
+
+@pytest.mark.parametrize("name", ["min_calibrated_ratio", "max_homography_ratio", "min_watermark_ratio"])
+def test_ratios_beyond_zero_and_one_are_refused(name):
+    for value in (0.0, 1.5):
+        with pytest.raises(ConfigError, match=name):
+            VerificationConfig(**{name: value})

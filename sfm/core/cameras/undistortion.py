@@ -15,6 +15,7 @@ import math
 import numpy as np
 from jaxtyping import Float32
 
+from sfm.core.arrays import Mask, Points2D, Rays
 from sfm.core.cameras.camera import Camera
 
 _ROWS_AT_ONCE = 64
@@ -66,6 +67,15 @@ def undistortion_grid(camera: Camera, target: Camera) -> tuple[Float32[np.ndarra
         map_x[top : top + len(rows)] = source[:, 0].reshape(len(rows), -1)
         map_y[top : top + len(rows)] = source[:, 1].reshape(len(rows), -1)
     return map_x, map_y
+
+
+def pinhole_pixels(rays: Rays, valid: Mask, camera: Camera) -> Points2D:
+    """Where rays would be seen without the distortion of a camera, px; NaN where they are not valid or point behind."""
+    k = camera.calibration_matrix
+    with np.errstate(invalid="ignore", divide="ignore"):
+        pixels = rays[:, :2] / rays[:, 2:] * [k[0, 0], k[1, 1]] + k[:2, 2]
+    pixels[~valid | ~(rays[:, 2] > 0)] = np.nan
+    return pixels
 
 
 def _zoom_range(camera: Camera) -> tuple[float, float]:

@@ -79,7 +79,9 @@ def _off_plane(
     """
     plane = homography_matrix(np.ascontiguousarray(columns[:, estimate.inliers]), problem.max_error)
     needed = max(math.ceil(_DOMINANT * plane.count), 8)
-    short = dataclasses.replace(config, min_iterations=20, max_iterations=_PLANE_SAMPLES, min_inliers=needed)
+    short = dataclasses.replace(
+        config, min_iterations=20, max_iterations=_PLANE_SAMPLES, min_inliers=needed, min_inlier_ratio=0.0
+    )
     found = ransac(plane, short, rng)
     if not isinstance(found, Estimate):
         return estimate
@@ -105,7 +107,10 @@ def _off_plane(
     if index < 0:
         return estimate
     model, squares = polish(problem, improved)
-    return dataclasses.replace(estimate, model=model, score=score, inliers=squares < problem.max_error**2)
+    inliers = squares < problem.max_error**2
+    if inliers.sum() < estimate.inliers.sum():
+        return estimate
+    return dataclasses.replace(estimate, model=model, score=score, inliers=inliers)
 
 
 def estimate_homography(
