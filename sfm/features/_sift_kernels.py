@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 _MOVES = 5
-_BLOCK = 64
+_WORD = 8
 _ORIENTATION_BINS = 36
 _MARGIN = 3
 _CELLS, _DIRECTIONS, _SAMPLES_A_CELL = 4, 8, 4
@@ -27,9 +27,8 @@ def find_extrema(stack, threshold, border, found):
     """
     differences, height, width = stack.shape[0] - 1, stack.shape[1], stack.shape[2]
     rows = np.zeros((3, differences, width), np.float32)
-    high, low = np.empty((differences, width), np.float32), np.empty((differences, width), np.float32)
-    highest, lowest = np.empty(width, np.float32), np.empty(width, np.float32)
-    flags = np.zeros(width + _BLOCK, np.uint8)
+    flags = np.zeros((width // _WORD + 1) * _WORD, np.uint8)
+    words = flags.view(np.uint64)
     count = 0
     for bottom in range(border - 1, height - border + 1):
         for k in range(differences):
@@ -37,19 +36,14 @@ def find_extrema(stack, threshold, border, found):
         y = bottom - 1
         if y < border:
             continue
-        for k in range(differences):
-            _extremes(rows[0, k], rows[0, k], rows[1, k], rows[1, k], rows[2, k], rows[2, k], high[k], low[k])
+        above, middle, below = rows[(y - 1) % 3], rows[y % 3], rows[bottom % 3]
         for k in range(1, differences - 1):
-            _extremes(high[k - 1], low[k - 1], high[k], low[k], high[k + 1], low[k + 1], highest, lowest)
-            _flag(rows[y % 3, k], highest, lowest, threshold, border, flags)
-            for start in range(0, width, _BLOCK):
-                flagged = 0
-                for x in range(_BLOCK):
-                    flagged += flags[start + x]
-                if flagged == 0:
+            _flag(above[k], middle[k], below[k], threshold, border, flags)
+            for word in range(len(words)):
+                if words[word] == 0:
                     continue
-                for x in range(start, start + _BLOCK):
-                    if flags[x] != 0:
+                for x in range(_WORD * word, _WORD * word + _WORD):
+                    if flags[x] != 0 and _is_extreme(above, middle, below, k, x):
                         if count < len(found):
                             found[count, 0], found[count, 1], found[count, 2] = k, y, x
                         count += 1
@@ -63,28 +57,35 @@ def _subtract(a, b, out):
 
 
 @njit(cache=True, nogil=True)
-def _extremes(a_high, a_low, b_high, b_low, c_high, c_low, high, low):
-    """The largest and the smallest of three rows each, column by column."""
-    for x in range(len(high)):
-        largest = a_high[x] if a_high[x] > b_high[x] else b_high[x]
-        high[x] = largest if largest > c_high[x] else c_high[x]
-        smallest = a_low[x] if a_low[x] < b_low[x] else b_low[x]
-        low[x] = smallest if smallest < c_low[x] else c_low[x]
-
-
-@njit(cache=True, nogil=True)
-def _flag(row, highest, lowest, threshold, border, flags):
-    """Marks what is the largest or the smallest of its 27; `highest` and `lowest` are those of the columns."""
+def _flag(above, row, below, threshold, border, flags):
+    """Marks what is the largest or the smallest of itself and the four next to it, with vector instructions."""
     # Slices, since an index that might be negative keeps a loop from being vectorised: it counts from the end.
     size = len(row) - 2 * border
     middle, out = row[border : border + size], flags[border : border + size]
-    a, b, c = highest[border - 1 : border - 1 + size], highest[border : border + size], highest[border + 1 :]
-    d, e, f = lowest[border - 1 : border - 1 + size], lowest[border : border + size], lowest[border + 1 :]
+    left, right = row[border - 1 : border - 1 + size], row[border + 1 : border + 1 + size]
+    up, down = above[border : border + size], below[border : border + size]
     for x in range(size):
         value = middle[x]
-        is_highest = (value > threshold) & (value >= a[x]) & (value >= b[x]) & (value >= c[x])
-        is_lowest = (value < -threshold) & (value <= d[x]) & (value <= e[x]) & (value <= f[x])
+        is_highest = (value > threshold) & (value >= left[x]) & (value >= right[x])
+        is_lowest = (value < -threshold) & (value <= left[x]) & (value <= right[x])
+        is_highest &= (value >= up[x]) & (value >= down[x])
+        is_lowest &= (value <= up[x]) & (value <= down[x])
         out[x] = is_highest | is_lowest
+
+
+@njit(cache=True, nogil=True)
+def _is_extreme(above, middle, below, k, x):
+    """Whether a value is the largest or the smallest of the 27 around it."""
+    value = middle[k, x]
+    for rows in (middle, above, below):
+        for layer in range(k - 1, k + 2):
+            a, b, c = rows[layer, x - 1], rows[layer, x], rows[layer, x + 1]
+            if value > 0:
+                if a > value or b > value or c > value:
+                    return False
+            elif a < value or b < value or c < value:
+                return False
+    return True
 
 
 @njit(cache=True, nogil=True)
@@ -155,29 +156,35 @@ def orientations(stack, keypoints, scales, angles):
     bins, rounding = np.float32(_ORIENTATION_BINS), np.float32(_MARGIN + 0.5)
     # Bins count from `_MARGIN`: before and after the circle there is room for its continuation.
     raw, smooth = np.empty(_ORIENTATION_BINS + 2 * _MARGIN), np.empty(_ORIENTATION_BINS + 2 * _MARGIN)
+    largest = 0.0
+    for scale in scales:
+        largest = max(largest, scale)
+    side = 2 * round(4.5 * largest) + 1
+    across, gx, gy = np.empty(side, np.float32), np.empty(side**2, np.float32), np.empty(side**2, np.float32)
     for n in range(len(keypoints)):
         image = stack[round(keypoints[n, 2])]
         column, line = round(keypoints[n, 0]), round(keypoints[n, 1])
         radius = round(4.5 * scales[n])
-        window = np.empty(2 * radius + 1, np.float32)
         for i in range(2 * radius + 1):
-            window[i] = math.exp(-((i - radius) ** 2) / (4.5 * scales[n] ** 2))
-        raw[:] = 0
-        left, right = max(column - radius, 1), min(column + radius, width - 2)
-        size = right - left + 1
-        across = window[left - column + radius : right - column + radius + 1]
-        gx, gy = np.empty(size, np.float32), np.empty(size, np.float32)
+            across[i] = math.exp(-((i - radius) ** 2) / (4.5 * scales[n] ** 2))
+        filled = 0
         for y in range(max(line - radius, 1), min(line + radius, height - 2) + 1):
+            reach = round(math.sqrt(radius**2 - (y - line) ** 2))
+            left, right = max(column - reach, 1), min(column + reach, width - 2)
+            size = right - left + 1
             above, below = image[y - 1, left : right + 1], image[y + 1, left : right + 1]
             before, after = image[y, left - 1 : right], image[y, left + 1 : right + 2]
-            along = window[y - line + radius]
+            along, weights = across[y - line + radius], across[left - column + radius : right - column + radius + 1]
+            row_x, row_y = gx[filled : filled + size], gy[filled : filled + size]
             for i in range(size):
-                weight = along * across[i]
-                gx[i] = weight * (after[i] - before[i])
-                gy[i] = weight * (below[i] - above[i])
-            _to_polar(gx, gy)
-            for i in range(size):
-                raw[np.uint32(gy[i] * bins + rounding)] += gx[i]
+                weight = along * weights[i]
+                row_x[i] = weight * (after[i] - before[i])
+                row_y[i] = weight * (below[i] - above[i])
+            filled += size
+        _to_polar(gx[:filled], gy[:filled])
+        raw[:] = 0
+        for i in range(filled):
+            raw[np.uint32(gy[i] * bins + rounding)] += gx[i]
         raw[_MARGIN] += raw[_MARGIN + _ORIENTATION_BINS]
         peak_angles(raw, smooth, angles[n])
 
