@@ -33,7 +33,8 @@ class SettingOptions:
     """Longest side to which larger photos are reduced when features are sought; 0 for full size."""
 
     features: Annotated[str | None, _arg("NAME", "sift")] = None
-    """Who finds and describes features: sift, orb, akaze, brisk, harris, shi_tomasi, fast, aliked, disk."""
+    """Who finds and describes features: sift, orb, akaze, brisk, harris, shi_tomasi, fast, aliked, disk, and for
+    videos klt."""
 
     masks: Annotated[Path | None, _arg("DIR", "IMAGES/masks or IMAGES/../masks")] = None
     """Masks, black where nothing shall be sought, called e.g. IMG.jpg.png, IMG.png, IMG_mask.png or mask_IMG.png for

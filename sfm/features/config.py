@@ -10,7 +10,9 @@ from sfm.core.errors import ConfigError
 SMALLEST_SIDE_PX = 16
 """Below this there is no second octave, and hardly a keypoint."""
 
-FeatureKind: TypeAlias = Literal["sift", "orb", "akaze", "brisk", "harris", "shi_tomasi", "fast", "aliked", "disk"]
+FeatureKind: TypeAlias = Literal[
+    "sift", "orb", "akaze", "brisk", "harris", "shi_tomasi", "fast", "aliked", "disk", "klt"
+]
 NETWORKS: tuple[FeatureKind, ...] = ("aliked", "disk")
 """Those that need an ONNX file."""
 CornerDescriptor: TypeAlias = Literal["brief", "freak"]
@@ -23,10 +25,11 @@ class FeatureConfig:
 
     kind: FeatureKind = "sift"
     """Who finds and describes them: `sift`; `orb`, `akaze`, `brisk` with binary descriptors of their own; the corners
-    of `harris`, `shi_tomasi`, `fast` at one scale with those of `corner_descriptor`; the networks `aliked`, `disk` from
-    the file `model`. Against 2,349 verified matches of SIFT with a near photo of a house front and 609 with one from
-    the side, of 8,000 features, ORB brings 1,993 and 200, AKAZE 1,819 and 338, BRISK 1,425 and 266, corners with BRIEF
-    some 2,300 and 480; ORB in a sixth of the time, AKAZE in a quarter, corners in a third."""
+    of `harris`, `shi_tomasi`, `fast` at one scale with those of `corner_descriptor`; the networks `aliked`, `disk`
+    from the file `model`; `klt` follows corners from frame to frame of a video (see `TrackingConfig`). Against 2,349
+    verified matches of SIFT with a near photo of a house front and 609 with one from the side, of 8,000 features, ORB
+    brings 1,993 and 200, AKAZE 1,819 and 338, BRISK 1,425 and 266, corners with BRIEF some 2,300 and 480; ORB in a
+    sixth of the time, AKAZE in a quarter, corners in a third."""
 
     max_image_size: int = 3200
     """Longest side in px to which larger images are reduced before detection; 0 keeps the full size. The time grows

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from sfm.core.arrays import BoolArray, ImageU8
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.scene import DescriptorKind, Features
 from sfm.features.affine import detect_in_views
 from sfm.features.binary import detect_akaze, detect_brisk, detect_orb
@@ -88,7 +88,7 @@ def extract(
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     if mask is not None and mask.shape != grey.shape:
         raise ValueError(f"the mask must have the shape of the image, {grey.shape}, got {mask.shape}")
-    reduced = _reduced(grey, config.max_image_size)
+    reduced = reduced_image(grey, config.max_image_size)
     size = f"{grey.shape[1]}×{grey.shape[0]} px"
     if min(reduced.shape) < SMALLEST_SIDE_PX:
         return Rejected("image_too_small", size)
@@ -141,6 +141,8 @@ def _detect(grey: np.ndarray, config: FeatureConfig, select: Selection) -> Descr
             return detect_corners(grey, config, select)
         case "aliked" | "disk":
             return detect_learned(grey, config, select)
+        case "klt":
+            raise ConfigError("klt follows corners through a video and finds none in a single image")
 
 
 def descriptor_kind(config: FeatureConfig) -> DescriptorKind:
@@ -150,6 +152,8 @@ def descriptor_kind(config: FeatureConfig) -> DescriptorKind:
             return DescriptorKind.SIFT
         case "aliked" | "disk":
             return DescriptorKind.LEARNED
+        case "klt":
+            return DescriptorKind.FOLLOWED
     return DescriptorKind.BINARY
 
 
@@ -171,7 +175,7 @@ def _lowered(config: FeatureConfig) -> Iterator[FeatureConfig]:
         yield dataclasses.replace(config, contrast_threshold=config.contrast_threshold / 2**k)
 
 
-def _reduced(grey: UInt8[np.ndarray, "H W"], max_size: int) -> UInt8[np.ndarray, "h w"]:
+def reduced_image(grey: UInt8[np.ndarray, "H W"], max_size: int) -> UInt8[np.ndarray, "h w"]:
     """At most `max_size` on the longest side, each pixel the mean of those it covers."""
     height, width = grey.shape
     longest = max(height, width)

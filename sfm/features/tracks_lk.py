@@ -5,8 +5,8 @@ found by Gauss–Newton steps from coarse to fine. Each corner is followed there
 home was hidden, or slid along an edge. Where corners get lost new ones are sought in the parts of the frame that have
 become empty.
 
-What comes out has the form of any features and matches: row k of a frame is a corner, and the matches of two frames
-in succession are the corners that both have. Descriptors are empty: there is nothing to match with other frames.
+A corner has a number for as long as it is followed. That is its descriptor: features of any two frames are the same
+corner where the numbers are equal. So the places where a video comes back to are not found.
 
 Reference:
     Lucas & Kanade, An iterative image registration technique, IJCAI 1981.
@@ -21,11 +21,11 @@ from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from sfm.core.arrays import BoolArray
 from sfm.core.errors import ConfigError
-from sfm.core.scene import DescriptorKind, Features, Matches
+from sfm.core.scene import DescriptorKind, Features
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 30, 0.01)
 _QUALITY = 0.01
@@ -37,7 +37,7 @@ _SIGMA = 1.5
 class TrackingConfig:
     """How corners are followed."""
 
-    max_features: int = 1000
+    max_corners: int = 1000
     """Corners a frame; lost ones are replaced."""
 
     min_distance_px: float = 12.0
@@ -53,8 +53,8 @@ class TrackingConfig:
     """Largest distance between a corner and where it comes to when it is followed forth and back."""
 
     def __post_init__(self) -> None:
-        if self.max_features < 1 or self.levels < 1:
-            raise ConfigError("max_features and levels must be at least 1")
+        if self.max_corners < 1 or self.levels < 1:
+            raise ConfigError("max_corners and levels must be at least 1")
         if self.window_px < 5 or self.window_px % 2 == 0:
             raise ConfigError(f"window_px must be odd and at least 5, got {self.window_px}")
         if self.min_distance_px <= 0 or self.max_return_px <= 0:
@@ -62,37 +62,41 @@ class TrackingConfig:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class TrackedFrame:
-    """The corners of a frame, and which of them are corners of the frame before (none in the first frame)."""
+class Frame:
+    """A grey image (H, W), and a mask (H, W) that is True where corners may be."""
 
-    features: Features
-    matches_with_previous: Matches
+    grey: UInt8[np.ndarray, "H W"]
+    mask: BoolArray | None = None
 
 
-def track_features(
-    frames: Iterable[np.ndarray], config: TrackingConfig = TrackingConfig(), mask: BoolArray | None = None
-) -> Iterator[TrackedFrame]:
-    """Features of each frame as it comes, with its matches; the columns of the matches are (previous, this frame).
+def track_features(frames: Iterable[Frame | None], config: TrackingConfig = TrackingConfig()) -> Iterator[Features]:
+    """The corners of each frame as it comes, those that were there before first, in px of the frame.
 
-    Args:
-        frames: grey (H, W) or RGB (H, W, 3), uint8, of one size.
-        mask: (H, W), the same for all frames; corners are kept where it is True.
+    Where a frame is missing, the next one is compared with the last one before it. A frame of another size begins
+    a new clip.
+
     Raises:
-        ValueError: a frame or the mask is of another size.
+        ValueError: a mask is of another size than its frame.
     """
     before: np.ndarray | None = None
-    points = np.zeros((0, 2), np.float32)
+    points, numbers, next_number = np.zeros((0, 2), np.float32), np.zeros(0, np.uint32), 0
     for frame in frames:
-        grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
-        for other, what in ((before, "frame"), (mask, "mask")):
-            if other is not None and other.shape != grey.shape:
-                raise ValueError(f"a {what} has shape {other.shape}, another frame {grey.shape}")
-        rows, found = np.zeros(0, np.int32), points
-        if before is not None and len(points):
-            rows, found = _followed(before, grey, points, mask, config)
-        points = np.concatenate([found, _new_corners(grey, found, mask, config)])
-        kept = np.arange(len(found), dtype=np.int32) if len(rows) else np.zeros(0, np.int32)
-        yield TrackedFrame(_features(points), Matches(np.stack([rows, kept], axis=1)))
+        if frame is None:
+            yield _features(points[:0], numbers[:0])
+            continue
+        grey, mask = frame.grey, frame.mask
+        if mask is not None and mask.shape != grey.shape:
+            raise ValueError(f"the mask must have the shape of the image, {grey.shape}, got {mask.shape}")
+        if before is None or before.shape != grey.shape:
+            points, numbers = points[:0], numbers[:0]
+        elif len(points):
+            rows, points = _followed(before, grey, points, mask, config)
+            numbers = numbers[rows]
+        new = _new_corners(grey, points, mask, config)
+        points = np.concatenate([points, new])
+        numbers = np.concatenate([numbers, np.arange(next_number, next_number + len(new), dtype=np.uint32)])
+        next_number += len(new)
+        yield _features(points, numbers)
         before = grey
 
 
@@ -122,7 +126,7 @@ def _new_corners(
     grey: np.ndarray, points: np.ndarray, mask: np.ndarray | None, config: TrackingConfig
 ) -> Float32[np.ndarray, "N 2"]:
     """Corners far from `points`, at most as many as are missing; in OpenCV's coordinates."""
-    missing = config.max_features - len(points)
+    missing = config.max_corners - len(points)
     if missing <= 0:
         return np.zeros((0, 2), np.float32)
     free = np.full(grey.shape, 255, np.uint8) if mask is None else mask.astype(np.uint8) * 255
@@ -143,13 +147,11 @@ def _allowed(mask: np.ndarray | None, points: np.ndarray) -> np.ndarray:
     return mask[tuple(np.rint(points[:, ::-1]).astype(int).T)]
 
 
-def _features(points: np.ndarray) -> Features:
-    """In the order in which they are followed: the matches count on it."""
-    count = len(points)
+def _features(points: np.ndarray, numbers: np.ndarray) -> Features:
     return Features(
         points.astype(np.float64) + 0.5,
-        np.full(count, _SIGMA, np.float32),
-        np.zeros(count, np.float32),
-        np.zeros((count, 0), np.uint8),
-        DescriptorKind.BINARY,
+        np.full(len(points), _SIGMA, np.float32),
+        np.zeros(len(points), np.float32),
+        numbers.astype("<u4").view(np.uint8).reshape(-1, 4),
+        DescriptorKind.FOLLOWED,
     )

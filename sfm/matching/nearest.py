@@ -8,7 +8,7 @@ The ratio is taken of Euclidean distances. For neighbours as near as matches are
 COLMAP uses, to within a per cent.
 
 Images with many features are searched through an index (see `cells`), whose distances are exact as well. Binary
-descriptors are compared by their different bits (see `binary`).
+descriptors are compared by their different bits (see `binary`), and corners of a video by their numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Bool, Num
+from jaxtyping import Bool, Num, UInt8
 
 from sfm.core.errors import ConfigError
 from sfm.core.scene import DescriptorKind, Features, Matches
@@ -106,6 +106,8 @@ def match_features(
     image1, image2 = _searchable(features1), _searchable(features2)
     check_descriptors(image1, image2)
     match image1.kind:
+        case DescriptorKind.FOLLOWED:
+            return _same_corners(image1.descriptors, image2.descriptors)
         case DescriptorKind.BINARY:
             found = nearest_bits(image1.words, image2.words, config.hashed_above)
         case DescriptorKind.SIFT | DescriptorKind.LEARNED:
@@ -133,6 +135,14 @@ def accepted_matches(found: Nearest, kind: DescriptorKind, width: int, config: M
     return Matches(np.stack([rows, index1[rows]], axis=1).astype(np.int32))
 
 
+def _same_corners(descriptors1: UInt8[np.ndarray, "N 4"], descriptors2: UInt8[np.ndarray, "M 4"]) -> Matches:
+    """The corners that both frames have; no frame has one twice."""
+    numbers = (np.ascontiguousarray(rows).view("<u4").ravel() for rows in (descriptors1, descriptors2))
+    _, rows1, rows2 = np.intersect1d(*numbers, assume_unique=True, return_indices=True)
+    order = np.argsort(rows1)
+    return Matches(np.stack([rows1[order], rows2[order]], axis=1).astype(np.int32))
+
+
 def _searchable(features: Features | SearchableFeatures) -> SearchableFeatures:
     return features if isinstance(features, SearchableFeatures) else SearchableFeatures(features)
 
@@ -144,7 +154,7 @@ def check_descriptors(image1: Features | SearchableFeatures, image2: Features | 
     lengths = image1.descriptors.shape[1], image2.descriptors.shape[1]
     if lengths[0] != lengths[1]:
         raise ValueError(f"descriptors must have the same length, got {lengths[0]} and {lengths[1]}")
-    if image1.kind != DescriptorKind.BINARY and 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
+    if image1.kind in _DESCRIPTOR_NORM and 2 * lengths[0] * 255**2 >= _EXACT_BELOW:
         raise ValueError(f"descriptors may have up to 128 dimensions, got {lengths[0]}")
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 from sfm.core.cameras import MODELS
 from sfm.core.errors import ConfigError
-from sfm.features import FeatureConfig
+from sfm.features import FeatureConfig, TrackingConfig
 from sfm.mapping import MappingConfig
 from sfm.matching import MatchingConfig
 from sfm.prepare import PrepareConfig
@@ -59,6 +59,8 @@ class PipelineConfig:
     cameras: CameraConfig = dataclasses.field(default_factory=CameraConfig)
     prepare: PrepareConfig = dataclasses.field(default_factory=PrepareConfig)
     features: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
+    tracking: TrackingConfig = dataclasses.field(default_factory=TrackingConfig)
+    """Of the features `klt`."""
     retrieval: RetrievalConfig = dataclasses.field(default_factory=RetrievalConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
     verification: VerificationConfig = dataclasses.field(default_factory=VerificationConfig)
@@ -73,6 +75,8 @@ class PipelineConfig:
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ConfigError(f"seed must not be negative, got {self.seed}")
+        if self.features.kind == "klt" and self.matching.guided:
+            raise ConfigError("the corners of klt have no descriptors that guided matching could compare")
 
 
 DEFAULTS = PipelineConfig()

@@ -1,18 +1,24 @@
-"""From the file of one photo to its features: read, hidden by its mask, prepared, searched; and the account of it."""
+"""From the files of photos to their features: read, hidden by masks, prepared, searched; and the account of it.
+
+Each photo is searched on its own, but for the frames of a video whose corners are followed: there the features of one
+depend on those before it.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, ImageError, Rejected
 from sfm.core.scene import Features
-from sfm.features import NETWORKS, FeatureConfig, descriptor_kind, extract
+from sfm.features import NETWORKS, FeatureConfig, Frame, descriptor_kind, extract, reduced_image, track_features
 from sfm.io.database import Decision
 from sfm.io.images import read_image
 from sfm.io.masks import masked_share, read_mask
@@ -61,15 +67,7 @@ def find_features(image: SceneImage, config: PipelineConfig) -> FoundFeatures:
     except ImageError as error:
         return FoundFeatures(_nothing(config.features), (decide("keypoints", 0.0, 1.0, "unreadable", error.cause),))
     decisions: list[Decision] = []
-
-    def prepare_and_tell(reduced: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W"]:
-        prepared = prepare(reduced, config.prepare)
-        verdict = "+".join(prepared.steps) or "as it is"
-        decisions.append(decide("preparation", None, None, verdict, prepared.summary()))
-        return prepared.image
-
-    preparation = None if config.prepare.mode == "off" else prepare_and_tell
-    found = extract(grey, config.features, mask, prepare=preparation)
+    found = extract(grey, config.features, mask, prepare=partial(_prepared, image, config, decisions))
     if isinstance(found, Rejected):
         decisions.append(decide("keypoints", 0.0, 1.0, found.reason, found.detail))
         return FoundFeatures(_nothing(config.features), tuple(decisions))
@@ -83,6 +81,51 @@ def find_features(image: SceneImage, config: PipelineConfig) -> FoundFeatures:
         decisions.append(decide("contrast_threshold", found.contrast_threshold, wanted, "lowered", told))
     decisions.append(decide("keypoints", float(len(found.features)), 1.0, "kept"))
     return FoundFeatures(found.features, tuple(decisions))
+
+
+def follow_features(images: Sequence[SceneImage], config: PipelineConfig) -> Iterator[FoundFeatures]:
+    """The corners of the frames of a video, one frame after the other.
+
+    The corners of a frame carry the numbers that they have in the frames before; its mask counts for it alone.
+    """
+    decisions: list[Decision] = []
+    full_from_reduced = np.ones(2)
+
+    def frames() -> Iterator[Frame | None]:
+        for image in images:
+            decisions.clear()
+            try:
+                grey = read_image(image.path, gray=True)
+                mask = read_mask(image.mask.path) if image.mask else None
+            except ImageError as error:
+                decisions.append(Decision(STAGE, image.name, "keypoints", 0.0, 1.0, "unreadable", error.cause))
+                yield None
+                continue
+            reduced = reduced_image(grey, config.features.max_image_size)
+            size = reduced.shape[1], reduced.shape[0]
+            full_from_reduced[:] = grey.shape[1] / size[0], grey.shape[0] / size[1]
+            if mask is not None and mask.shape != reduced.shape:
+                mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
+            yield Frame(_prepared(image, config, decisions, reduced), mask)
+
+    for image, features in zip(images, track_features(frames(), config.tracking), strict=True):
+        features = dataclasses.replace(features, points2D=features.points2D * full_from_reduced)
+        if not decisions or decisions[-1].gate != "keypoints":
+            verdict = "kept" if len(features) else "no_features"
+            decisions.append(Decision(STAGE, image.name, "keypoints", float(len(features)), 1.0, verdict))
+        yield FoundFeatures(features, tuple(decisions))
+
+
+def _prepared(
+    image: SceneImage, config: PipelineConfig, decisions: list[Decision], reduced: UInt8[np.ndarray, "H W"]
+) -> UInt8[np.ndarray, "H W"]:
+    """The reduced image as features are sought in it; adds to `decisions` what was done to it."""
+    if config.prepare.mode == "off":
+        return reduced
+    prepared = prepare(reduced, config.prepare)
+    verdict = "+".join(prepared.steps) or "as it is"
+    decisions.append(Decision(STAGE, image.name, "preparation", None, None, verdict, prepared.summary()))
+    return prepared.image
 
 
 def model_digest(config: FeatureConfig) -> str:

@@ -23,11 +23,13 @@ from sfm.pipeline.pair_scores import STAGE, has_visual_words, scores_of
 from sfm.pipeline.stages import Pair, Run, forget_other_pairs, match_all, verify_all
 from sfm.retrieval import PairScores, RetrievalConfig, exhaustive_pairs, missing_links, promising_pairs
 from sfm.retrieval.choice import choose_method
-from sfm.retrieval.pairs import earth_centered_m, nearby_pairs, spatial_pairs
+from sfm.retrieval.pairs import earth_centered_m, nearby_pairs, sequential_pairs, spatial_pairs
 from sfm.retrieval.sequence import sequence_pairs
 
 _SECONDS_PER_PAIR, _SECONDS_PER_FEATURE = 0.015, 7e-6
 """Time to match and verify a pair on one core: 43 ms at 4,000 features an image. For the estimate only."""
+_WITHOUT_SCORES = ("exhaustive", "sequential", "list")
+"""Methods that need no comparison of descriptors, if loops are not closed."""
 
 
 def check_pair_settings(run: Run) -> None:
@@ -39,6 +41,11 @@ def check_pair_settings(run: Run) -> None:
             and the descriptors have no visual words.
     """
     config, kind = run.config.retrieval, run.config.features.kind
+    if kind == "klt" and config.method not in ("auto", *_WITHOUT_SCORES):
+        raise ConfigError(
+            f"the corners of klt have no descriptors to find pairs by {config.method}",
+            remedy=f"choose auto, {' or '.join(_WITHOUT_SCORES)}",
+        )
     if config.method == "vocabulary" and descriptor_kind(run.config.features) != DescriptorKind.SIFT:
         raise ConfigError(f"the descriptors of {kind} have no visual words", remedy="take --pairs look")
     if config.method == "list":
@@ -69,6 +76,9 @@ def first_pairs(run: Run, feature_keys: Mapping[int, str]) -> PairChoice:
         return PairChoice([pair for pair in _listed(run) if usable.issuperset(pair)], "as listed")
     if len(ids) < 3 or config.method == "exhaustive" or few:
         return PairChoice(exhaustive_pairs(ids), "all with all")
+    if run.config.features.kind == "klt":
+        pairs = sequential_pairs(len(ids), config.overlap)
+        return PairChoice(_named(ids, pairs), "sequential: corners are followed from frame to frame")
     scores = scores_of(run, feature_keys, ids)
     pairs, why = _chosen(run, ids, scores)
     return PairChoice(_named(ids, pairs), why, scores)

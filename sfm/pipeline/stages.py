@@ -22,10 +22,11 @@ from sfm.core.execution import ordered_map
 from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
 from sfm.features import NETWORKS, working_memory_bytes
 from sfm.io.database import Database
+from sfm.io.images import natural_key
 from sfm.matching import LightGlue, MatchingConfig, SearchableFeatures, match_features, match_guided
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.image_features import STAGE as FEATURES
-from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, model_digest
+from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, follow_features, model_digest
 from sfm.pipeline.keys import code_digest, key_of
 from sfm.pipeline.memory import free_memory_bytes
 from sfm.verification import verify_pair
@@ -63,19 +64,20 @@ class Run:
 
 def extract_all(run: Run) -> dict[int, str]:
     """Features of all images; returns the key of each."""
-    stage, config = FEATURES, run.config.features
-    code = code_digest("sfm.prepare", "sfm.features", "sfm.io", "sfm.core")
-    basis = key_of(code, cv2.__version__, config, run.config.prepare, model_digest(config))
-    keys = {
-        image_id: key_of(basis, image.digest, *([image.mask.digest] if image.mask else []))
-        for image_id, image in run.images.items()
-    }
+    stage, keys = FEATURES, _feature_keys(run)
     counts = run.database.feature_counts()
     stale = _stale(run, stage, keys, present=counts)
-    threads = _threads_that_fit(run, stale)
 
     def compute(image_id: int) -> tuple[int, FoundFeatures]:
         return image_id, find_features(run.images[image_id], run.config)
+
+    def results() -> Iterator[tuple[int, FoundFeatures]]:
+        if run.config.features.kind != "klt":
+            yield from ordered_map(compute, stale, threads=_threads_that_fit(run, stale))
+        elif stale:  # corners are followed from the first frame on, though not all of them are new
+            ids, wanted = _in_order_of_names(run), set(stale)
+            found = zip(ids, follow_features([run.images[k] for k in ids], run.config), strict=True)
+            yield from ((k, features) for k, features in found if k in wanted)
 
     def write(result: tuple[int, FoundFeatures]) -> None:
         image_id, found = result
@@ -87,11 +89,30 @@ def extract_all(run: Run) -> dict[int, str]:
         run.observer(FeaturesExtracted(name=name, count=len(found.features)))
 
     run.observer(StageStarted(stage=stage, total=len(stale), cached=len(keys) - len(stale)))
-    _keep_as_they_come(run.database, ordered_map(compute, stale, threads=threads), write)
+    _keep_as_they_come(run.database, results(), write)
     counts = run.database.feature_counts()
     mean = np.mean([counts[image_id] for image_id in keys]) if keys else 0
     run.observer(StageFinished(stage=stage, summary=f"{len(keys)} images, {mean:.0f} keypoints each"))
     return keys
+
+
+def _feature_keys(run: Run) -> dict[int, str]:
+    """What the features of each image are computed from; for corners that are followed, also all frames before it."""
+    config, code = run.config.features, code_digest("sfm.prepare", "sfm.features", "sfm.io", "sfm.core")
+    basis = key_of(code, cv2.__version__, config, run.config.prepare, model_digest(config))
+    follows = config.kind == "klt"
+    if follows:
+        basis = key_of(basis, run.config.tracking)
+    keys, key = {}, basis
+    for image_id in _in_order_of_names(run) if follows else run.images:
+        image = run.images[image_id]
+        key = key_of(key if follows else basis, image.digest, *([image.mask.digest] if image.mask else []))
+        keys[image_id] = key
+    return keys
+
+
+def _in_order_of_names(run: Run) -> list[int]:
+    return sorted(run.images, key=lambda image_id: natural_key(run.images[image_id].name))
 
 
 def check_networks(config: PipelineConfig) -> None:

@@ -23,6 +23,8 @@ class DescriptorKind(IntEnum):
     """By the number of different bits, eight a column."""
     LEARNED = 101
     """By Euclidean distance; rows minus 128 have length 256."""
+    FOLLOWED = 102
+    """Equal or not: the number of a corner that is followed through a video, four bytes, the lowest first."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
