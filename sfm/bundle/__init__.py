@@ -1,14 +1,17 @@
 """Bundle adjustment."""
 
 from sfm.bundle.adjustment import adjust, squared_errors
+from sfm.bundle.covariance import BundleCovariance, covariance
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
 from sfm.bundle.reconstruction import free_params_of, problem_from_reconstruction, update_reconstruction
 
 __all__ = [
     "BundleConfig",
+    "BundleCovariance",
     "BundleProblem",
     "BundleResult",
     "adjust",
+    "covariance",
     "free_params_of",
     "problem_from_reconstruction",
     "squared_errors",

@@ -11,7 +11,7 @@ from sfm.bundle.gauge import held_by_two_cameras
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
 from sfm.bundle.system import BundleSystem
-from sfm.core.arrays import FloatArray
+from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.events import SILENT, BundleAdjusted, Observer
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 from sfm.core.optim.losses import evaluate_loss
@@ -33,6 +33,25 @@ def adjust(
         threads: the result is the same to the last bit for any number.
         scope: passed on to the event, e.g. "local".
     """
+    system, active = system_of(problem, config, threads)
+    result = _result(problem, system, _minimize(system, config), active)
+    observer(
+        BundleAdjusted(
+            scope=scope,
+            images=len(system.layout.slot_image),
+            points=len(problem.points3D),
+            observations=len(system.layout.image),
+            iterations=result.iterations,
+            initial_cost=result.initial_cost,
+            final_cost=result.final_cost,
+            reason=result.reason,
+        )
+    )
+    return result
+
+
+def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tuple[BundleSystem, BoolArray]:
+    """The normal equations of `problem`, and which observations (n,) take part."""
     squared = squared_errors(problem)
     active = np.isfinite(squared)
     layout = lay_out(problem, active)
@@ -42,21 +61,7 @@ def adjust(
     weighted = squared[active] if problem.obs_sigmas is None else squared[active] / problem.obs_sigmas[active] ** 2
     worst = max(_LOST_PX**2, float(weighted.max(initial=0.0)))
     lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
-    system = BundleSystem(problem, layout, held, config, lost_cost, threads)
-    result = _result(problem, system, _minimize(system, config), active)
-    observer(
-        BundleAdjusted(
-            scope=scope,
-            images=len(layout.slot_image),
-            points=len(problem.points3D),
-            observations=len(layout.image),
-            iterations=result.iterations,
-            initial_cost=result.initial_cost,
-            final_cost=result.final_cost,
-            reason=result.reason,
-        )
-    )
-    return result
+    return BundleSystem(problem, layout, held, config, lost_cost, threads), active
 
 
 def squared_errors(problem: BundleProblem) -> FloatArray:

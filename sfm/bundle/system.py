@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,7 +47,7 @@ class BundleSystem:
         self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, lost_cost: float,
         threads: int,
     ) -> None:  # fmt: skip
-        self._layout, self._threads = layout, threads
+        self.layout, self._threads = layout, threads
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self._free_points = problem.free_points.copy()
         self._loss = (loss_id(config.loss), float(config.loss_scale_px), float(lost_cost))
@@ -66,7 +66,7 @@ class BundleSystem:
         self._pose_count = 6 * len(layout.slot_image)
         slots = np.arange(len(layout.slot_image))
         self._diagonal_blocks = slots * (slots + 3) // 2
-        self._held = np.concatenate([held.ravel(), (layout.columns[layout.slot_camera] < 0).ravel()])
+        self.held = np.concatenate([held.ravel(), (layout.columns[layout.slot_camera] < 0).ravel()])
         self._H, self._F = np.empty((chunks, images, 6, 6)), np.empty((chunks, images, K, 6 + K))
         self._h = np.empty((chunks, images, 6 + K))
         self._V, self._g, self._M = np.empty((points, 6)), np.empty((points, 3)), np.empty((points, 6))
@@ -79,8 +79,13 @@ class BundleSystem:
     @property
     def free_count(self) -> int:
         """Number of scalars that may change and that an observation sees."""
-        seen = np.diff(self._layout.offsets) > 0
-        return int(np.sum(~self._held)) + 3 * int(np.sum(self._free_points & seen))
+        seen = np.diff(self.layout.offsets) > 0
+        return int(np.sum(~self.held)) + 3 * int(np.sum(self._free_points & seen))
+
+    @property
+    def prior_count(self) -> int:
+        """Number of camera parameters that have a prior."""
+        return int(np.sum(self._prior_weight > 0))
 
     @property
     def points3D(self) -> FloatArray:
@@ -104,7 +109,7 @@ class BundleSystem:
 
     def linearize(self) -> tuple[float, float]:
         """Cost and largest entry of the gradient at the current parameters."""
-        lay, now = self._layout, self._state
+        lay, now = self.layout, self._state
         for sums in (self._H, self._F, self._h, self._B):
             sums.fill(0)
 
@@ -120,19 +125,26 @@ class BundleSystem:
         cost = sum(self._run(chunk, list(enumerate(lay.point_chunks)))) + self._prior_cost(now.params)
         self._images = _total(self._H), _total(self._F), _total(self._h)
         self._add_images()
-        self._gradient = np.where(self._held, 0.0, -self._reduced.side())
+        self._gradient = np.where(self.held, 0.0, -self._reduced.side())
         self._diagonal = self._marquardt_diagonal()
         largest = max(np.abs(self._gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
         return float(cost), float(largest)
+
+    def information(self) -> tuple[FloatArray, Eliminated]:
+        """The reduced matrix S (N, N) without damping, and what is known of the points, as last linearised."""
+        self._add_images()
+        self._eliminate(0.0)
+        lower = np.tril(self._reduced.matrix())
+        return lower + np.tril(lower, -1).T, Eliminated(self._W, self._B, self._V, self._M)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
         self._add_images()
         self._eliminate(damping)
-        delta = solve_reduced(self._reduced, damping * self._diagonal, self._held)
+        delta = solve_reduced(self._reduced, damping * self._diagonal, self.held)
         if delta is None:
             return None
-        lay, now, then = self._layout, self._state, self._trial
+        lay, now, then = self.layout, self._state, self._trial
         pose_delta, camera_delta = delta[: self._pose_count].reshape(-1, 6), delta[self._pose_count :]
         kernels.move_poses(
             lay.slot_image, pose_delta, now.wxyz, now.translations, then.wxyz, then.translations, then.rotations
@@ -167,7 +179,7 @@ class BundleSystem:
 
     def _add_images(self) -> None:
         """The reduced system before elimination: what images contribute on their own."""
-        reduced, lay = self._reduced, self._layout
+        reduced, lay = self._reduced, self.layout
         H, F, h = self._images
         reduced.clear()
         reduced.blocks[0, self._diagonal_blocks] = H[lay.slot_image]
@@ -189,7 +201,7 @@ class BundleSystem:
 
     def _unexpected(self, params: FloatArray) -> FloatArray:
         """θ − θ₀ (S, K) of the free camera parameters that have a prior, 0 for the others."""
-        lay = self._layout
+        lay = self.layout
         index = np.maximum(lay.columns[lay.slot_camera], 0)
         values = np.take_along_axis(params[lay.slot_camera], index, axis=1)
         return np.where(self._prior_weight > 0, values - self._expected, 0.0)
@@ -198,7 +210,7 @@ class BundleSystem:
         return 0.5 * float(np.sum(self._prior_weight * self._unexpected(params) ** 2))
 
     def _eliminate(self, damping: float) -> None:
-        reduced, lay = self._reduced, self._layout
+        reduced, lay = self._reduced, self.layout
         invert_blocks(0, len(self._V), self._V, damping, self._M)
 
         def poses(job: tuple[int, np.ndarray]) -> None:
@@ -223,7 +235,7 @@ class BundleSystem:
         """The diagonal of the normal matrix; tiny entries are raised to a part of the largest of their kind."""
         parts = (
             np.einsum("iaa->ia", self._reduced.blocks[0, self._diagonal_blocks]),
-            np.diagonal(self._reduced.corner[0]).reshape(-1, max(self._layout.columns.shape[1], 1)),
+            np.diagonal(self._reduced.corner[0]).reshape(-1, max(self.layout.columns.shape[1], 1)),
         )
         raised = []
         for part in parts:
@@ -232,11 +244,20 @@ class BundleSystem:
         return np.concatenate(raised)
 
     def _move_params(self, delta: FloatArray) -> None:
-        lay = self._layout
+        lay = self.layout
         columns = lay.columns[lay.slot_camera]
         rows, k = np.nonzero(columns >= 0)
         cells = lay.slot_camera[rows], columns[rows, k]
         self._trial.params[cells] = self._state.params[cells] + delta.reshape(columns.shape)[rows, k]
+
+
+class Eliminated(NamedTuple):
+    """Of the points: couplings with poses (n, 3, 6) and cameras (E, 3, K), information and its inverse (P, 6)."""
+
+    W: np.ndarray
+    B: np.ndarray
+    V: np.ndarray
+    M: np.ndarray
 
 
 @dataclasses.dataclass(slots=True)

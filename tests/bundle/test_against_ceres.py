@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm.bundle import BundleConfig, BundleProblem, adjust
+from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, adjust, covariance
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 
@@ -81,3 +81,25 @@ def test_the_final_cost_is_no_higher_than_that_of_ceres(loss, refine):
 
     assert ours.final_cost < 0.5 * ours.initial_cost
     assert theirs.final_cost * (1 - 1e-6) <= ours.final_cost <= theirs.final_cost * (1 + 1e-6)
+
+
+def test_rotations_are_as_uncertain_as_by_ceres():
+    """Seen from the image that both hold, rotations do not depend on how the scale is held."""
+    reconstruction = synthetic(8, 200, noise_px=0.5)
+    options, config = pycolmap.BundleAdjustmentOptions(), pycolmap.BundleAdjustmentConfig()
+    options.print_summary = options.refine_focal_length = options.refine_extra_params = False
+    pycolmap.bundle_adjustment(reconstruction, options)
+    images = sorted(reconstruction.reg_image_ids())
+    for image_id in images:
+        config.add_image(image_id)
+        config.set_constant_cam_intrinsics(reconstruction.images[image_id].camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
+    theirs = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), reconstruction, adjuster)
+    ours = covariance(problem_of(reconstruction, refine=False))
+    assert isinstance(ours, BundleCovariance)
+    assert not ours.poses[0].any()  # the same image is held
+    for row, image_id in list(enumerate(images))[2:]:
+        # Their tangent of a rotation is half an angle.
+        rotation = 4 * theirs.get_cam_cov_from_world(image_id)[:3, :3]
+        np.testing.assert_allclose(ours.poses[row, :3, :3], rotation, rtol=1e-4, atol=1e-5 * np.trace(rotation))
