@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 from sfm.core.optim.losses import evaluate_loss
 
 _LOST_PX = 100.0
+_GRADUAL_STEPS, _MAX_HALVINGS = 5, 20
+"""Steps with each of the wider scales of a graduated loss, and how many of these there are at most."""
 
 
 def adjust(
@@ -29,10 +32,17 @@ def adjust(
     projection that it would keep where it is; an observation that loses its own all the same, because its camera
     moved, is charged like the worst at the start (at least 100 px).
 
+    If `config.graduated`, the costs and the table are those of the last scale.
+
     Args:
         threads: the result is the same to the last bit for any number.
         scope: passed on to the event, e.g. "local".
     """
+    for scale in _wider_scales(problem, config):
+        wider = dataclasses.replace(config, loss_scale_px=scale, max_iterations=_GRADUAL_STEPS)
+        system, _ = system_of(problem, wider, threads)
+        _minimize(system, wider)
+        problem = _moved(problem, system)
     system, active = system_of(problem, config, threads)
     result = _result(problem, system, _minimize(system, config), active)
     observer(
@@ -88,14 +98,30 @@ def _minimize(system: BundleSystem, config: BundleConfig) -> Summary:
     return minimize(system, rules)
 
 
+def _wider_scales(problem: BundleProblem, config: BundleConfig) -> list[float]:
+    """Scales of the loss from that of the worst residual down to twice the configured one."""
+    if not config.graduated:
+        return []
+    sigmas = 1.0 if problem.obs_sigmas is None else problem.obs_sigmas
+    squared = squared_errors(problem) / sigmas**2
+    worst = math.sqrt(float(np.nanmax(squared, initial=0.0)))
+    halvings = min(max(math.ceil(math.log2(max(worst / config.loss_scale_px, 1.0))), 0), _MAX_HALVINGS)
+    return [config.loss_scale_px * 2.0**k for k in range(halvings, 0, -1)]
+
+
+def _moved(problem: BundleProblem, system: BundleSystem) -> BundleProblem:
+    """The problem with the parameters of the system."""
+    return dataclasses.replace(
+        problem,
+        camera_params=system.camera_params,
+        cams_from_world=system.cams_from_world,
+        points3D=system.points3D,
+    )
+
+
 def _result(problem: BundleProblem, system: BundleSystem, summary: Summary, active: np.ndarray) -> BundleResult:
     return BundleResult(
-        problem=dataclasses.replace(
-            problem,
-            camera_params=system.camera_params,
-            cams_from_world=system.cams_from_world,
-            points3D=system.points3D,
-        ),
+        problem=_moved(problem, system),
         initial_cost=summary.initial_cost,
         final_cost=summary.final_cost,
         reason=summary.reason,

@@ -101,6 +101,9 @@ class BundleConfig:
     """What a residual costs; trivial is plain least squares, right where outliers have been filtered."""
     loss_scale_px: float = 1.0
     """Residual in px from which a robust loss grows more slowly."""
+    graduated: bool = False
+    """Begin with a scale as wide as the worst residual and narrow it by factors of two, so that a loss which gives up
+    on large residuals, tukey or truncated, does not give up on those that only a bad start makes large."""
     max_iterations: int = 100
     """Steps that are tried at most."""
     relative_cost_tolerance: float = 1e-6

@@ -224,3 +224,22 @@ def test_the_inputs_are_not_modified_and_the_event_tells_the_outcome(make_proble
     assert (event.scope, event.reason) == ("local", result.reason)
     assert (event.initial_cost, event.final_cost) == (result.initial_cost, result.final_cost)
     assert (event.images, event.points, event.observations) == (6, 60, len(start.obs_images))
+
+
+@pytest.mark.parametrize("loss", ["tukey", "truncated"])
+def test_losses_that_give_up_on_outliers_find_the_truth_from_afar_if_graduated(make_problem, perturbed, rng, loss):
+    truth = make_problem(rng, images=6, points=80, seen=1.0)
+    measured = truth.obs_points2D + 0.2 * rng.normal(size=truth.obs_points2D.shape)
+    wrong = rng.random(len(measured)) < 0.2
+    measured[wrong] += rng.uniform(-200, 200, (int(wrong.sum()), 2))
+    start = perturbed(dataclasses.replace(truth, obs_points2D=measured), rng, 0.03)
+    assert np.sqrt(np.nanmedian(squared_errors(start))) > 10
+    found = {}
+    for graduated in (True, False):
+        config = BundleConfig(loss=loss, loss_scale_px=2.0, graduated=graduated, relative_cost_tolerance=1e-8)
+        result = adjust(start, config)
+        found[graduated] = np.sqrt(squared_errors(result.problem))
+    assert np.median(found[True][~wrong]) < 0.4
+    assert (found[True][~wrong] < 2).mean() > 0.97
+    assert (found[True][wrong] > 2).mean() > 0.9
+    assert np.median(found[False][~wrong]) > 2

@@ -6,7 +6,7 @@ import math
 
 import numba as nb
 
-TRIVIAL, HUBER, SOFT_L1, CAUCHY = 0, 1, 2, 3
+TRIVIAL, HUBER, SOFT_L1, CAUCHY, TUKEY, TRUNCATED = 0, 1, 2, 3, 4, 5
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -23,4 +23,9 @@ def loss_and_weight(kind, scale, s):
         return 2.0 * a2 * (root - 1.0), 1.0 / root
     if kind == CAUCHY:
         return a2 * math.log1p(s / a2), 1.0 / (1.0 + s / a2)
+    if kind == TUKEY:
+        rest = max(1.0 - s / a2, 0.0)
+        return a2 / 3.0 * (1.0 - rest * rest * rest), rest * rest
+    if kind == TRUNCATED and s > a2:
+        return a2, 0.0
     return s, 1.0

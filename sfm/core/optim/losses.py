@@ -10,8 +10,14 @@ With scale a, in the unit of the residual:
     huber     s for s ≤ a², 2 a √s − a² beyond
     soft_l1   2 a² (√(1 + s/a²) − 1)
     cauchy    a² log(1 + s/a²)
+    tukey     a²/3 (1 − (1 − s/a²)³) for s ≤ a², a²/3 beyond
+    truncated s for s ≤ a², a² beyond
+
+Beyond a, residuals have no weight by the last two: whatever starts outside stays there, unless the scale is wide at
+first and narrows step by step (graduated non-convexity; see `BundleConfig.graduated`).
 
 Reference:
+    Yang, Antonante, Tzoumas & Carlone, Graduated non-convexity for robust spatial perception, RA-L 2020.
     Triggs, McLauchlan, Hartley & Fitzgibbon, Bundle adjustment — a modern synthesis, 2000, §4.3.
 """
 
@@ -24,13 +30,15 @@ import numpy as np
 from sfm.core.arrays import FloatArray
 from sfm.core.optim import _loss_kernels as kernels
 
-Loss: TypeAlias = Literal["trivial", "huber", "soft_l1", "cauchy"]
+Loss: TypeAlias = Literal["trivial", "huber", "soft_l1", "cauchy", "tukey", "truncated"]
 
 _IDS = {
     "trivial": kernels.TRIVIAL,
     "huber": kernels.HUBER,
     "soft_l1": kernels.SOFT_L1,
     "cauchy": kernels.CAUCHY,
+    "tukey": kernels.TUKEY,
+    "truncated": kernels.TRUNCATED,
 }
 
 
@@ -59,4 +67,9 @@ def evaluate_loss(loss: Loss, squared_residuals: FloatArray, scale: float = 1.0)
             rho, weight = 2 * (root - 1), 1 / root
         case "cauchy":
             rho, weight = np.log1p(s), 1 / (1 + s)
+        case "tukey":
+            rest = np.maximum(1 - s, 0.0)
+            rho, weight = (1 - rest**3) / 3, rest**2
+        case "truncated":
+            rho, weight = np.minimum(s, 1.0), (s <= 1) * 1.0
     return np.asarray(scale**2 * rho), np.asarray(weight)

@@ -7,7 +7,7 @@ from sfm.core.optim import evaluate_loss
 from sfm.core.optim._loss_kernels import loss_and_weight
 from sfm.core.optim.losses import loss_id
 
-LOSSES = ("trivial", "huber", "soft_l1", "cauchy")
+LOSSES = ("trivial", "huber", "soft_l1", "cauchy", "tukey", "truncated")
 SQUARED = np.concatenate([[0.0], np.logspace(-6, 6, 60)])
 
 
@@ -18,6 +18,8 @@ def written_out(loss: str, s: float, a: float) -> float:
         "huber": r * r if r <= 1 else 2 * r - 1,
         "soft_l1": 2 * (np.hypot(1, r) - 1),
         "cauchy": np.log(1 + r * r),
+        "tukey": (1 - (1 - r * r) ** 3) / 3 if r <= 1 else 1 / 3,
+        "truncated": min(r * r, 1.0),
     }
     return a * a * by_loss[loss]
 
