@@ -18,6 +18,7 @@ COMMANDS = {
     "match": "the next: matches of these pairs",
     "verify": "the next: which matches a rigid scene explains, and how",
     "inspect": "photos: sharpness, exposure, EXIF, copies, what cannot be read",
+    "refine": "bundle adjustment of any COLMAP model",
     "view": "look at a workspace in the Rerun viewer",
     "compare": "pose errors of a model against a reference",
     "convert": "a model from one format to another: COLMAP binary, text, PLY",

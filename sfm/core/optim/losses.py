@@ -23,7 +23,7 @@ Reference:
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from sfm.core.optim import _loss_kernels as kernels
 
 Loss: TypeAlias = Literal["trivial", "huber", "soft_l1", "cauchy", "tukey", "truncated"]
 
+LOSSES: tuple[Loss, ...] = get_args(Loss)
 _IDS = {
     "trivial": kernels.TRIVIAL,
     "huber": kernels.HUBER,
