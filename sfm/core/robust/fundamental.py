@@ -11,7 +11,17 @@ from sfm.core.arrays import FloatArray, Mask, Matrix3, Points2D, Value, Vector, 
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rotation import skew
 from sfm.core.robust._problem_kernels import SIZE
-from sfm.core.robust.ransac import CompiledProblem, Estimate, RansacConfig, farthest_bound, loss_of, polish, ransac
+from sfm.core.robust.ransac import (
+    LOCAL_DATA,
+    LOCAL_TOLERANCE,
+    CompiledProblem,
+    Estimate,
+    RansacConfig,
+    farthest_bound,
+    loss_of,
+    polish,
+    ransac,
+)
 from sfm.core.robust.relative_pose import check_lengths, chosen, finite_rows, scatter
 from sfm.core.robust.two_view import common_normalisation, fundamental_matrix, homography_matrix
 
@@ -81,15 +91,17 @@ def _off_plane(
     if plane is None:
         return estimate
     squares = homography_matrix(columns, wide.max_error).squared_errors(plane)
-    off = columns[:, squares > (_OFF_PLANE * wide.max_error) ** 2]
-    if off.shape[1] < 2:
+    off = rng.permutation(np.flatnonzero(squares > (_OFF_PLANE * wide.max_error) ** 2))
+    if len(off) < 2:
         return estimate
+    off = columns[:, off[:_PLANE_DATA]]
     models = _parallax_models(off, plane, rng)
     # Every one of them explains the plane: what lies off it decides.
     index, _, _ = fundamental_matrix(off, wide.max_error).best(models, loss, np.inf)
     if index < 0:
         return estimate
-    improved = wide.improved(models[index], loss, wide.max_error, 1e-4)
+    some = wide.ordered(rng.permutation(wide.count)[:LOCAL_DATA])
+    improved = some.improved(models[index], loss, wide.max_error, LOCAL_TOLERANCE)
     index, score, _ = wide.best(improved[None], loss, estimate.score)
     if index < 0:
         return estimate
