@@ -156,7 +156,8 @@ def estimate_homography(
 ) -> MatrixEstimate | Rejected:
     """H with x2 ~ H x1, by four points and LO-RANSAC on Sampson errors in px, which treat both images alike.
 
-    The sign of H is such that the inliers have w > 0.
+    The sign of H is such that the inliers have w > 0, and both cameras see one side of a plane, so that det H > 0: no H
+    mirrors.
 
     Args:
         quality: (N,) larger for pairs that are more likely right (see `ransac`).
