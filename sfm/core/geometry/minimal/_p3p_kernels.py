@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sfm.core.geometry.minimal._polynomial_kernels import real_roots
+from sfm.core.geometry.minimal._cubic_kernels import cubic_roots
 
 MAX_SOLUTIONS = 4
 _POLISH_STEPS = 3
@@ -65,7 +65,7 @@ def _line_pair(conics, d, lines, adjugate, cubic, roots):
             for j in range(3):
                 cubic[1 + n] += adjugate[i, j] * conics[1 - n, j, i]
     best, s, axis = 0.0, np.nan, 0
-    count = real_roots(cubic, roots)
+    count = cubic_roots(cubic, roots)
     for n in range(count + 1):
         root = roots[n] if n < count else s
         for i in range(3):
