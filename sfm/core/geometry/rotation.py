@@ -89,17 +89,13 @@ class Rotation3(Value):
         trace = d.sum(-1)
         # Rows of the symmetric matrix 4 q qᵀ; any row is parallel to q, the one of the largest entry is accurate.
         x, y, z = d[..., 0], d[..., 1], d[..., 2]
-        wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
-        xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
-        rows = np.stack(
-            [
-                np.stack([1 + trace, wx, wy, wz], -1),
-                np.stack([wx, 1 + x - y - z, xy, xz], -1),
-                np.stack([wy, xy, 1 - x + y - z, yz], -1),
-                np.stack([wz, xz, yz, 1 - x - y + z], -1),
-            ],
-            -2,
-        )
+        rows = np.empty((*m.shape[:-2], 4, 4))
+        rows[..., 0, 0], rows[..., 1, 1] = 1 + trace, 1 + x - y - z
+        rows[..., 2, 2], rows[..., 3, 3] = 1 - x + y - z, 1 - x - y + z
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            rows[..., 0, k + 1] = rows[..., k + 1, 0] = m[..., j, i] - m[..., i, j]
+            rows[..., i + 1, j + 1] = rows[..., j + 1, i + 1] = m[..., i, j] + m[..., j, i]
         best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), -1)
         q = np.take_along_axis(rows, best[..., None, None], -2)[..., 0, :]
         return Rotation3(np.where(q[..., :1] < 0, -q, q))

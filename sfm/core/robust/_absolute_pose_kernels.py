@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sfm.core.geometry.minimal._p3p_kernels import p3p
 from sfm.core.robust._loss_kernels import robust_weight
 from sfm.core.robust._manifold_kernels import moved_pose
 
@@ -25,6 +26,15 @@ class Resection(NamedTuple):
     """The problem of an absolute pose: its columns (12, N), contiguous."""
 
     data: np.ndarray
+
+
+def solve(problem, samples, models):
+    return p3p(problem.data, samples, models)
+
+
+def plausible(problem, model, sample):
+    """Always: the depths of the sample are positive."""
+    return True
 
 
 def squared_errors(problem, model, start, stop, out):

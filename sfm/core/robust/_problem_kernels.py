@@ -3,6 +3,8 @@
 A problem is a named tuple with its data. numba compiles them once for each type of tuple, and the functions here
 are, in each, those of the type's own module, which are plain functions, since nothing else calls them compiled:
 
+    solve            fills an array with the models of minimal samples, rows of indices; returns how many
+    plausible        whether a model is possible for the sample that it was made of
     squared_errors   r² of data start … stop under a model
     parameters       the number of parameters that the refinement moves
     start            the state of a model, the form in which it is refined; False if it has none
@@ -26,6 +28,14 @@ _MODULES = {
     _two_view_kernels.TwoViews: _two_view_kernels,
     _absolute_pose_kernels.Resection: _absolute_pose_kernels,
 }
+
+
+def solve(problem, samples, models):
+    return _MODULES[type(problem)].solve(problem, samples, models)
+
+
+def plausible(problem, model, sample):
+    return _MODULES[type(problem)].plausible(problem, model, sample)
 
 
 def squared_errors(problem, model, start, stop, out):
@@ -61,5 +71,5 @@ def _specialised(generic):
     overload(generic)(functools.update_wrapper(chosen, generic))
 
 
-for _generic in (squared_errors, parameters, start, model_of, moved, equations):
+for _generic in (solve, plausible, squared_errors, parameters, start, model_of, moved, equations):
     _specialised(_generic)

@@ -4,7 +4,7 @@ Errors are first-order geometric (Sampson) distances, in the units of the data, 
 algebraic error of a correspondence and ∇e its gradient by the coordinates of both keypoints:
 
     epipolar      e = r2ᵀ M r1                       r² = e² / |∇e|²
-    homography    e = x2 − π(H x1),  A = ∂π(H x1)/∂x1     r² = eᵀ (I + A Aᵀ)⁻¹ e
+    homography    e = x2 − π(H x1),  A = ∂π(H x1)/∂x1     r² = eᵀ (I + A Aᵀ)⁻¹ e, infinite where w ≤ 0
 
 ESSENTIAL holds rays and their derivatives J by the pixel, so that ∇e = (J1ᵀ Eᵀ r2, J2ᵀ E r1): the tangent Sampson
 error, in px for any camera model. FUNDAMENTAL and HOMOGRAPHY hold points, r = (x, y, 1) and J = (1 0; 0 1; 0 0).
@@ -24,10 +24,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sfm.core.geometry.minimal._five_point_kernels import five_point
+from sfm.core.geometry.minimal._seven_point_kernels import four_point, seven_point
 from sfm.core.robust import _manifold_kernels as manifold
 from sfm.core.robust._loss_kernels import robust_weight
 
 ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY = 0, 1, 2
+_BLOCK = 64
 
 
 class TwoViews(NamedTuple):
@@ -35,6 +38,70 @@ class TwoViews(NamedTuple):
 
     kind: int
     data: np.ndarray
+
+
+def solve(problem, samples, models):
+    if problem.kind == ESSENTIAL:
+        return five_point(problem.data, samples, models)
+    if problem.kind == FUNDAMENTAL:
+        return seven_point(problem.data, samples, models)
+    return four_point(problem.data, samples, models)
+
+
+def plausible(problem, model, sample):
+    """Whether both cameras can see the whole sample in front of them; turns the sign of a homography so that w > 0."""
+    if problem.kind == HOMOGRAPHY:
+        return visible_plane(problem.data, model, sample)
+    return visible_points(problem, model, sample)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def visible_plane(data, m, sample):
+    """Whether w has one sign on the sample, which m is given, and then det H > 0: both cameras see the same side."""
+    positive = 0
+    for i in sample:
+        positive += m[6] * data[0, i] + m[7] * data[1, i] + m[8] > 0.0
+    if 0 < positive < sample.shape[0]:
+        return False
+    if positive == 0:
+        for k in range(9):
+            m[k] = -m[k]
+    return (
+        m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
+        > 0.0
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def visible_points(problem, m, sample):
+    """Whether F r1 and t × r2, which are parallel, agree in direction for all of the sample or for none of it.
+
+    With depths d along the rays, d1 F r1 = d2 t × r2 up to one sign for all points.
+    """
+    data, first = problem.data, 0.0
+    # The left null vector t: the longest cross product of two columns of m.
+    t0 = t1 = t2 = longest = 0.0
+    for j in range(3):
+        k = (j + 1) % 3
+        a, b = m[3 + j] * m[6 + k] - m[6 + j] * m[3 + k], m[6 + j] * m[k] - m[j] * m[6 + k]
+        c = m[j] * m[3 + k] - m[3 + j] * m[k]
+        square = a * a + b * b + c * c
+        if square > longest:
+            t0, t1, t2, longest = a, b, c, square
+    for i in sample:
+        if problem.kind == ESSENTIAL:
+            x1, y1, z1, x2, y2, z2 = data[0, i], data[1, i], data[2, i], data[3, i], data[4, i], data[5, i]
+        else:
+            x1, y1, z1, x2, y2, z2 = data[0, i], data[1, i], 1.0, data[2, i], data[3, i], 1.0
+        side = (
+            (m[0] * x1 + m[1] * y1 + m[2] * z1) * (t1 * z2 - t2 * y2)
+            + (m[3] * x1 + m[4] * y1 + m[5] * z1) * (t2 * x2 - t0 * z2)
+            + (m[6] * x1 + m[7] * y1 + m[8] * z1) * (t0 * y2 - t1 * x2)
+        )
+        if side * first < 0.0:
+            return False
+        first = side
+    return True
 
 
 def squared_errors(problem, model, start, stop, out):
@@ -69,7 +136,10 @@ def squared_errors(problem, model, start, stop, out):
         for i in range(start, stop):
             x1, y1 = data[0, i], data[1, i]
             w = m[6] * x1 + m[7] * y1 + m[8]
-            w = 1.0 / w if w != 0.0 else 1e150
+            if not w > 0.0:
+                out[i] = np.inf
+                continue
+            w = 1.0 / w
             u, v = (m[0] * x1 + m[1] * y1 + m[2]) * w, (m[3] * x1 + m[4] * y1 + m[5]) * w
             e0, e1 = data[2, i] - u, data[3, i] - v
             a, b = (m[0] - u * m[6]) * w, (m[1] - u * m[7]) * w
@@ -87,7 +157,7 @@ def start(problem, model, state):
     if problem.kind != HOMOGRAPHY:
         return manifold.matrix_state(model, problem.kind == ESSENTIAL, state)
     # H[2, 2] vanishes only if the centre of the data is mapped to infinity.
-    unit = model[8] if abs(model[8]) > 1e-9 else 1e-9
+    unit = max(abs(model[8]), 1e-9)
     for k in range(9):
         state[k] = model[k] / unit
     return True
@@ -119,6 +189,21 @@ def equations(problem, state, loss, square_scale, max_square, hessian, gradient)
     return epipolar_equations(problem, model, tangent, loss, square_scale, max_square, hessian, gradient)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
+def _add_products(d, weighted, errors, count, square, product):
+    """Adds W d dᵀ (lower triangle) and W d e of `count` data; sums in any order are three times as fast."""
+    for j in range(9):
+        for k in range(j + 1):
+            total = 0.0
+            for i in range(count):
+                total += weighted[j, i] * d[k, i]
+            square[j, k] += total
+        total = 0.0
+        for i in range(count):
+            total += weighted[j, i] * errors[i]
+        product[j] += total
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hessian, gradient):
     """Adds JᵀWJ and JᵀWr of the epipolar errors of m (9,) to `hessian`, `gradient`; returns Σ ρ(r²).
@@ -128,7 +213,9 @@ def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hess
     The sums are taken over M, of nine numbers for either matrix, and brought to the parameters at the end.
     """
     data, calibrated = problem.data, problem.kind == ESSENTIAL
-    square, product, d = np.zeros((9, 9)), np.zeros(9), np.empty(9)
+    square, product = np.zeros((9, 9)), np.zeros(9)
+    # Derivatives of a block of data, one datum a column, and the same times their weights.
+    d, weighted, errors, filled = np.empty((9, _BLOCK)), np.empty((9, _BLOCK)), np.empty(_BLOCK), 0
     cost = 0.0
     for i in range(data.shape[1]):
         if calibrated:
@@ -167,14 +254,21 @@ def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hess
         else:
             p0, p1, p2, q0, q1, q2 = kappa * g0, kappa * g1, 0.0, kappa * g2, kappa * g3, 0.0
         p0, p1, p2 = x1 - p0, y1 - p1, z1 - p2
-        d[0], d[1], d[2] = x2 * p0 - q0 * x1, x2 * p1 - q0 * y1, x2 * p2 - q0 * z1
-        d[3], d[4], d[5] = y2 * p0 - q1 * x1, y2 * p1 - q1 * y1, y2 * p2 - q1 * z1
-        d[6], d[7], d[8] = z2 * p0 - q2 * x1, z2 * p1 - q2 * y1, z2 * p2 - q2 * z1
-        for j in range(9):
-            left = weight * d[j]
-            product[j] += left * e
-            for k in range(9):
-                square[j, k] += left * d[k]
+        for k in range(3):
+            left, right = (x2, q0) if k == 0 else (y2, q1) if k == 1 else (z2, q2)
+            d[3 * k, filled], d[3 * k + 1, filled] = left * p0 - right * x1, left * p1 - right * y1
+            d[3 * k + 2, filled] = left * p2 - right * z1
+        for k in range(9):
+            weighted[k, filled] = weight * d[k, filled]
+        errors[filled] = e
+        filled += 1
+        if filled == _BLOCK:
+            _add_products(d, weighted, errors, filled, square, product)
+            filled = 0
+    _add_products(d, weighted, errors, filled, square, product)
+    for j in range(9):
+        for k in range(j):
+            square[k, j] = square[j, k]
     for p in range(tangent.shape[0]):
         for k in range(9):
             gradient[p] += tangent[p, k] * product[k]
@@ -194,7 +288,10 @@ def _homography_equations(data, m, loss, square_scale, max_square, hessian, grad
     for i in range(data.shape[1]):
         x1, y1 = data[0, i], data[1, i]
         w = m[6] * x1 + m[7] * y1 + m[8]
-        w = 1.0 / w if w != 0.0 else 1e150
+        if not w > 0.0:
+            cost += robust_weight(np.inf, loss, square_scale, max_square)[0]
+            continue
+        w = 1.0 / w
         u, v = (m[0] * x1 + m[1] * y1 + m[2]) * w, (m[3] * x1 + m[4] * y1 + m[5]) * w
         e0, e1 = u - data[2, i], v - data[3, i]
         a, b = (m[0] - u * m[6]) * w, (m[1] - u * m[7]) * w

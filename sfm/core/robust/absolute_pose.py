@@ -53,7 +53,7 @@ def resection(
     _, by_point, _, projects = camera.project_with_jacobians(rays)
     usable = valid & projects & np.isfinite(points2D).all(1) & np.isfinite(points3D).all(1)
     data = np.concatenate([rays, by_point.reshape(-1, 6), points3D], axis=1)[usable]
-    return CompiledProblem(Resection(np.ascontiguousarray(data.T)), Solver(p3p, 3, 4), max_error_px), usable
+    return CompiledProblem(Resection(np.ascontiguousarray(data.T)), Solver(p3p, 3, 4, effort=0.5), max_error_px), usable
 
 
 class ReprojectionProblem:

@@ -10,17 +10,30 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Mask, Matrix3, Points2D, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rotation import skew
-from sfm.core.robust._loss_kernels import MARGINALIZED, TRUNCATED
+from sfm.core.robust._loss_kernels import TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE
-from sfm.core.robust.ransac import CompiledProblem, Estimate, RansacConfig, polish, ransac
+from sfm.core.robust.ransac import (
+    LOCAL_DATA,
+    LOCAL_TOLERANCE,
+    CompiledProblem,
+    Estimate,
+    RansacConfig,
+    farthest_bound,
+    loss_of,
+    polish,
+    ransac,
+)
 from sfm.core.robust.relative_pose import check_lengths, chosen, finite_rows, scatter
+from sfm.core.robust.sampling import Sampler
 from sfm.core.robust.two_view import common_normalisation, fundamental_matrix, homography_matrix
 
 _DOMINANT = 0.6
 """Share of the inliers of F that makes a plane dominant."""
 _OFF_PLANE = 2.0
 """Pairs are off the plane beyond so many error bounds."""
-_PLANE_SAMPLES, _PARALLAX_SAMPLES = 200, 300
+_PLANE_SAMPLES, _PARALLAX_SAMPLES = 60, 150
+"""Of 60 samples of four one is clean on a dominant plane with a probability of 0.9998."""
+_PLANE_DATA = 200
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -77,40 +90,61 @@ def _off_plane(
     Reference:
         Chum, Werner & Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005.
     """
-    plane = homography_matrix(np.ascontiguousarray(columns[:, estimate.inliers]), problem.max_error)
-    needed = max(math.ceil(_DOMINANT * plane.count), 8)
-    short = dataclasses.replace(
-        config, min_iterations=20, max_iterations=_PLANE_SAMPLES, min_inliers=needed, min_inlier_ratio=0.0
-    )
-    found = ransac(plane, short, rng)
-    if not isinstance(found, Estimate):
+    wide, loss = problem.within(problem.max_error * farthest_bound(config)), loss_of(config)
+    near = wide.squared_errors(estimate.model) < wide.max_error**2
+    plane = _dominant_plane(columns[:, near], wide.max_error, rng)
+    if plane is None:
         return estimate
-    squares = homography_matrix(columns, problem.max_error).squared_errors(found.model)
-    off = np.flatnonzero(squares > (_OFF_PLANE * problem.max_error) ** 2)
+    squares = homography_matrix(columns, wide.max_error).squared_errors(plane)
+    off = rng.permutation(np.flatnonzero(squares > (_OFF_PLANE * wide.max_error) ** 2))
     if len(off) < 2:
         return estimate
-    h = found.model[:9].reshape(3, 3)
-    ones = np.ones(len(off))
-    lines = np.cross(np.stack([*columns[2:, off], ones], 1), np.stack([*columns[:2, off], ones], 1) @ h.T)
-    first, second = rng.integers(0, len(off), (2, _PARALLAX_SAMPLES))
+    off = columns[:, off[:_PLANE_DATA]]
+    models = _parallax_models(off, plane, rng)
+    # Every one of them explains the plane: what lies off it decides.
+    index, _, _ = fundamental_matrix(off, wide.max_error).best(models, loss, np.inf)
+    if index < 0:
+        return estimate
+    some = wide.ordered(rng.permutation(wide.count)[:LOCAL_DATA])
+    improved = some.improved(models[index], loss, wide.max_error, LOCAL_TOLERANCE)
+    index, score, _ = wide.best(improved[None], loss, estimate.score)
+    if index < 0:
+        return estimate
+    model, _ = polish(wide, improved)
+    inliers = problem.squared_errors(model) < problem.max_error**2
+    if inliers.sum() < estimate.inliers.sum():
+        return estimate
+    return dataclasses.replace(estimate, model=model, score=score, inliers=inliers)
+
+
+def _dominant_plane(columns: FloatArray, max_error: float, rng: np.random.Generator) -> FloatArray | None:
+    """The homography of most of the inliers of F, if there is one; a few hundred of them tell."""
+    some = rng.permutation(columns.shape[1])[:_PLANE_DATA]
+    needed = max(math.ceil(_DOMINANT * len(some)), 8)
+    if len(some) < needed:
+        return None
+    problem = homography_matrix(columns[:, some], max_error)
+    sampler = Sampler(len(some), problem.sample_size, _PLANE_SAMPLES, rng)
+    model, bounds = np.zeros(SIZE), np.full(2, len(some) * max_error**2)
+    while sampler.used < _PLANE_SAMPLES:
+        used, _ = problem.search(sampler.ahead(_PLANE_SAMPLES - sampler.used), TRUNCATED, bounds, model)
+        sampler.use(used)
+    found = model.any() and np.sum(problem.squared_errors(model) < max_error**2) >= needed
+    return model if found else None
+
+
+def _parallax_models(off: FloatArray, plane: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """[e]× H for the epipoles e in which the lines x2 × H x1 of two pairs of points off the plane meet."""
+    h = plane[:9].reshape(3, 3)
+    ones = np.ones(off.shape[1])
+    lines = np.cross(np.stack([*off[2:], ones], 1), np.stack([*off[:2], ones], 1) @ h.T)
+    first, second = rng.integers(0, len(lines), (2, _PARALLAX_SAMPLES))
     epipoles = np.cross(lines[first], lines[second])
     lengths = np.linalg.norm(epipoles, axis=1)
     epipoles = epipoles[lengths > 1e-12] / lengths[lengths > 1e-12, None]
     models = np.zeros((len(epipoles), SIZE))
     models[:, :9] = (skew(epipoles) @ h).reshape(-1, 9)
-    loss = MARGINALIZED if config.score == "marginalized" else TRUNCATED
-    index, _, _ = problem.best(models, loss, np.inf)
-    if index < 0:
-        return estimate
-    improved = problem.improved(models[index], loss, problem.max_error, 1e-4)
-    index, score, _ = problem.best(improved[None], loss, estimate.score)
-    if index < 0:
-        return estimate
-    model, squares = polish(problem, improved)
-    inliers = squares < problem.max_error**2
-    if inliers.sum() < estimate.inliers.sum():
-        return estimate
-    return dataclasses.replace(estimate, model=model, score=score, inliers=inliers)
+    return models
 
 
 def estimate_homography(
@@ -123,7 +157,8 @@ def estimate_homography(
 ) -> MatrixEstimate | Rejected:
     """H with x2 ~ H x1, by four points and LO-RANSAC on Sampson errors in px, which treat both images alike.
 
-    The sign of H is such that the inliers have w > 0.
+    The sign of H is such that the inliers have w > 0, and both cameras see one side of a plane, so that det H > 0: no H
+    mirrors.
 
     Args:
         quality: (N,) larger for pairs that are more likely right (see `ransac`).

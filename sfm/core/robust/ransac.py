@@ -1,7 +1,9 @@
 """Robust estimation by locally optimised random sampling.
 
 Minimal samples propose models; a model's score is a robust sum Σ ρ(r²) over all data. Whenever the best minimal model
-improves, Levenberg–Marquardt refines it over the same loss (local optimisation). Sampling ends when a sample of m
+improves, Levenberg–Marquardt refines it over the same loss (local optimisation). Models that a camera cannot see are
+passed over, and the others are given up as soon as the first data, which are in random order, tell that they are not
+the best ones. Sampling ends when a sample of m
 inliers, all of them drawn without replacement from I inliers among N, would have been missed with probability 1 − p:
 
     k = c log(1 − p) / log(1 − Π_{i<m} (I − i) / (N − i)),
@@ -9,12 +11,13 @@ inliers, all of them drawn without replacement from I inliers among N, would hav
 the exact form of the criterion, where c allows for samples that are clean but too noisy. The winner is refined once
 more with Cauchy's loss at a scale taken from its own residuals, which makes the result insensitive to the error bound.
 
-Samples are drawn, solved and scored in batches by compiled kernels that hold no lock, so that threads work on as many
-problems at once as there are cores; the loop itself is this page. A single kernel around all of it was no faster and
-took twice as long to compile. Its random numbers come from one that is drawn here.
+One kernel, which holds no lock, takes many samples up to the next better model, so that threads work on as many
+problems at once as there are cores; the loop itself is this page. Its random numbers come from one that is drawn here.
 
 References:
     Lebeda, Matas & Chum, Fixing the locally optimized RANSAC, BMVC 2012.
+    Chum, Matas & Kittler, Locally optimized RANSAC, DAGM 2003, for samples of the inliers.
+    Chum & Matas, Optimal randomized RANSAC, PAMI 2008, for giving models up early.
     Schönberger & Larsson, Fixing the RANSAC stopping criterion, arXiv:2503.07829.
 """
 
@@ -30,15 +33,17 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Mask, Vector
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.robust._absolute_pose_kernels import Resection
-from sfm.core.robust._loop_kernels import best_model, improve
+from sfm.core.robust._loop_kernels import best_model, improve, search
 from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE
-from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 from sfm.core.robust._two_view_kernels import TwoViews
+from sfm.core.robust.sampling import Sampler
 
-_BATCH = 20
 _SCALE = 1.5
-_LOCAL_TOLERANCE, _FINAL_TOLERANCE = 1e-4, 1e-6
+# Local optimisation looks at no more data than these, since all of them wait for the end.
+LOCAL_DATA = 500
+_REACH, _FARTHEST_PX = 4.0, 8.0
+LOCAL_TOLERANCE, _FINAL_TOLERANCE = 1e-2, 1e-5
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -48,15 +53,17 @@ class RansacConfig:
     max_error_px: float = 4.0
     """Largest error of an inlier, in px of the full image. 4 is COLMAP's default; 1 suits sharp, well calibrated
     images. The final refinement adapts to the noise, so that the accuracy depends little on it."""
-    score: Literal["truncated", "marginalized"] = "truncated"
-    """By which models are compared: Σ min(r², ε²), or its mean over all error bounds ε up to the largest, which asks
-    no knowledge of the noise."""
+    score: Literal["truncated", "marginalized"] = "marginalized"
+    """By which models are compared: Σ min(r², ε²) for the largest error ε of an inlier, or the mean of the like over
+    all bounds from 0 up to four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge of the
+    noise: with bounds of 1 px, less than the noise of many photos, it misses fewer models than any peer."""
     confidence: float = 0.9999
     """Probability with which an all-inlier sample has been drawn when sampling ends."""
-    trials_factor: float = 3.0
-    """The computed number of samples is multiplied by this: not every clean sample gives a good model."""
+    trials_factor: float = 1.0
+    """The computed number of samples is multiplied by this. Not every clean sample gives a good model, but nearly every
+    one does when it is refined: twice as many find hardly more."""
     min_iterations: int = 100
-    """Samples drawn at least. Local optimisation makes a hundred enough for easy data."""
+    """Samples drawn at least, half as many for P3P and H. Local optimisation makes a hundred enough for easy data."""
     max_iterations: int = 10000
     """Samples drawn at most; 10,000 find an essential matrix among 25 % inliers."""
     min_inliers: int = 15
@@ -79,6 +86,14 @@ class Solver(NamedTuple):
     kernel: Callable[[FloatArray, np.ndarray, FloatArray], int]
     sample_size: int
     max_solutions: int
+    restarts: int = 0
+    """Rounds of sampling among the inliers of the best model, for models whose refinement has many local minima."""
+    effort: float = 1.0
+    """Share of the smallest number of samples that is needed: less for small samples, whose models are more stable."""
+
+    def moderated(self, config: RansacConfig) -> RansacConfig:
+        """The configuration with the smallest number of samples that this solver needs."""
+        return dataclasses.replace(config, min_iterations=math.ceil(self.effort * config.min_iterations))
 
 
 class CompiledProblem:
@@ -88,13 +103,27 @@ class CompiledProblem:
     """
 
     def __init__(self, data: TwoViews | Resection, solver: Solver, max_error: float) -> None:
-        self.data, self.solver, self.max_error = data, solver, max_error
+        self.data, self.solver, self.max_error, self._some = data, solver, max_error, None
         self.sample_size, self.count = solver.sample_size, data.data.shape[1]
 
     def ordered(self, order: np.ndarray) -> CompiledProblem:
         """The problem with its data in another order."""
         columns = np.ascontiguousarray(self.data.data[:, order])
         return CompiledProblem(self.data._replace(data=columns), self.solver, self.max_error)
+
+    def within(self, max_error: float) -> CompiledProblem:
+        """The problem with another largest error of an inlier."""
+        return CompiledProblem(self.data, self.solver, max_error)
+
+    def search(self, samples: np.ndarray, loss: np.int64, bounds: FloatArray, best: FloatArray) -> tuple[int, int]:
+        """Looks for a better model among those of minimal samples, rows of indices; see `_loop_kernels`.
+
+        Data must be in random order: models are given up for the first of them, and refined on the first of them.
+        """
+        if self._some is None:
+            self._some = self.data._replace(data=np.ascontiguousarray(self.data.data[:, :LOCAL_DATA]))
+        models = np.zeros((self.solver.max_solutions, SIZE))
+        return search(self.data, self._some, samples, models, loss, self.max_error**2, LOCAL_TOLERANCE, bounds, best)
 
     def proposals(self, samples: np.ndarray) -> FloatArray:
         """Models of minimal samples, rows of indices."""
@@ -155,46 +184,56 @@ def ransac(
     needed = max(problem.sample_size, config.min_inliers)
     if problem.count < needed:
         return Rejected("too_few_points", f"{problem.count} of {needed} needed")
-    order = None if quality is None else np.argsort(-quality, kind="stable")
-    searched = problem if order is None else problem.ordered(order)
-    loss = MARGINALIZED if config.score == "marginalized" else TRUNCATED
-    generator, growth = rng.integers(1, 2**32, 1), np.zeros(3)
-    best = best_minimal = problem.count * problem.max_error**2
+    config, loss = problem.solver.moderated(config), loss_of(config)
+    wide, shuffled = problem.within(problem.max_error * farthest_bound(config)), rng.permutation(problem.count)
+    searched, ordered = wide.ordered(shuffled), None if quality is None else quality[shuffled]
+    sampler = Sampler(problem.count, problem.sample_size, config.max_iterations, rng, ordered)
+    model, bounds = np.zeros(SIZE), np.full(2, problem.count * wide.max_error**2)
     # As long as no model has enough inliers, sampling ends when one would have been found.
     hopeful = dataclasses.replace(config, trials_factor=1.0)
-    hopeless = required_iterations(needed, problem.count, problem.sample_size, hopeful)
-    drawn, limit, reach = 0, hopeless, problem.count
-    model = None
-    while drawn < limit:
-        samples = np.empty((min(_BATCH, limit - drawn), problem.sample_size), np.int64)
-        if order is None:
-            draw_samples(generator, problem.count, samples)
-        else:
-            draw_progressively(generator, drawn, reach, problem.count, float(config.max_iterations), growth, samples)
-        drawn += len(samples)
-        models = searched.proposals(samples)
-        index, score, _ = searched.best(models, loss, best_minimal)
-        if index < 0:
-            continue
-        best_minimal = score
-        candidate = searched.improved(models[index], loss, problem.max_error, _LOCAL_TOLERANCE)
-        index, score, inliers = searched.best(candidate[None], loss, best)
-        if index < 0:
-            continue
-        best, model = score, candidate
+    limit = hopeless = required_iterations(needed, problem.count, problem.sample_size, hopeful)
+    while sampler.used < limit:
+        used, inliers = searched.search(sampler.ahead(limit - sampler.used), loss, bounds, model)
+        sampler.use(used)
         if inliers < needed:
-            limit = hopeless
-            continue
-        limit = required_iterations(inliers, problem.count, problem.sample_size, config)
-        if order is not None:
-            squares = searched.squared_errors(model)
-            limit, reach = _progressive_limit(squares < problem.max_error**2, problem.sample_size, config)
-    if model is None:
-        return Rejected("no_model", f"none of {drawn} samples gave one")
-    model, squares = polish(problem, model)
-    inliers = squares < problem.max_error**2
-    rejected = judged(inliers, needed, config)
-    return Estimate(model, best, inliers, drawn) if rejected is None else rejected
+            limit = limit if inliers < 0 else hopeless
+        elif sampler.order is None:
+            limit = required_iterations(inliers, problem.count, problem.sample_size, config)
+        else:
+            near = searched.squared_errors(model)[sampler.order] < wide.max_error**2
+            limit, sampler.reach = _progressive_limit(near, problem.sample_size, config)
+    if not model.any():
+        return Rejected("no_model", f"none of {sampler.used} samples gave one")
+    _search_inliers(searched, sampler, loss, bounds, model)
+    model, squares = polish(wide, model)
+    mask = squares < problem.max_error**2
+    rejected = judged(mask, needed, config)
+    return Estimate(model, float(bounds[1]), mask, sampler.used) if rejected is None else rejected
+
+
+def _search_inliers(
+    problem: CompiledProblem, sampler: Sampler, loss: np.int64, bounds: FloatArray, model: FloatArray
+) -> None:
+    """Replaces the model by a better one among those of samples of its inliers, if there is one.
+
+    Refinement of F ends in one of many local minima; the models of clean samples lie near most of them.
+    """
+    inliers = np.flatnonzero(problem.squared_errors(model) < problem.max_error**2)
+    for _ in range(problem.solver.restarts if len(inliers) > problem.sample_size else 0):
+        bounds[0] = problem.count * problem.max_error**2
+        problem.search(sampler.among(inliers), loss, bounds, model)
+
+
+def loss_of(config: RansacConfig) -> np.int64:
+    """The loss by which models are compared."""
+    return MARGINALIZED if config.score == "marginalized" else TRUNCATED
+
+
+def farthest_bound(config: RansacConfig) -> float:
+    """The largest error bound over which scores are taken, as a multiple of the largest error of an inlier."""
+    if config.score == "truncated":
+        return 1.0
+    return max(min(_REACH, _FARTHEST_PX / config.max_error_px), 1.0)
 
 
 def _progressive_limit(inliers: Mask, sample_size: int, config: RansacConfig) -> tuple[int, int]:
@@ -232,6 +271,7 @@ def polish(problem: CompiledProblem, model: FloatArray) -> tuple[FloatArray, Vec
         return model, squares
     # 1.5 medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat from 1 to 2 medians; at
     # 3.5, which is 95 % efficient on Gaussian noise, it is lower: the noise of keypoints has tails.
-    scale = max(_SCALE * math.sqrt(float(np.median(inliers))), 1e-3 * problem.max_error)
+    median = np.partition(inliers, len(inliers) // 2)[len(inliers) // 2]
+    scale = max(_SCALE * math.sqrt(float(median)), 1e-3 * problem.max_error)
     model = problem.improved(model, CAUCHY, scale, _FINAL_TOLERANCE)
     return model, problem.squared_errors(model)

@@ -24,14 +24,18 @@ def essential_matrix(
 def fundamental_matrix(columns: FloatArray, max_error: float) -> CompiledProblem:
     """x2ᵀ F x1 = 0 on points (4, N) near the origin."""
     return CompiledProblem(
-        kernels.TwoViews(kernels.FUNDAMENTAL, np.ascontiguousarray(columns)), Solver(seven_point, 7, 3), max_error
+        kernels.TwoViews(kernels.FUNDAMENTAL, np.ascontiguousarray(columns)),
+        Solver(seven_point, 7, 3, restarts=4),
+        max_error,
     )
 
 
 def homography_matrix(columns: FloatArray, max_error: float) -> CompiledProblem:
     """x2 ~ H x1 on points (4, N) near the origin."""
     return CompiledProblem(
-        kernels.TwoViews(kernels.HOMOGRAPHY, np.ascontiguousarray(columns)), Solver(four_point, 4, 1), max_error
+        kernels.TwoViews(kernels.HOMOGRAPHY, np.ascontiguousarray(columns)),
+        Solver(four_point, 4, 1, restarts=1, effort=0.5),
+        max_error,
     )
 
 

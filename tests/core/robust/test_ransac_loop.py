@@ -11,15 +11,17 @@ from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._absolute_pose_kernels import equations as pose_equations
 from sfm.core.robust._damping_kernels import damped_step
+from sfm.core.robust._loop_kernels import score
 from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED, robust_weight
 from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
-from sfm.core.robust._two_view_kernels import ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY, moved, start
+from sfm.core.robust._two_view_kernels import ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY, moved, plausible, start
 from sfm.core.robust._two_view_kernels import equations as two_view_equations
 from sfm.core.robust.absolute_pose import ReprojectionProblem, resection
-from sfm.core.robust.ransac import RansacConfig, ransac, required_iterations
+from sfm.core.robust.ransac import RansacConfig, farthest_bound, ransac, required_iterations
 from sfm.core.robust.refinement import refine
 from sfm.core.robust.relative_pose import flat
+from sfm.core.robust.sampling import Sampler
 from sfm.core.robust.two_view import essential_matrix, fundamental_matrix, homography_matrix
 
 
@@ -45,6 +47,9 @@ def _twin_squared_errors(problem, data, matrix):
 
         steps = 1e-6 * np.eye(4)
         jacobian = np.stack([(error(column + s) - error(column - s)) / 2e-6 for s in steps], 1)
+        if problem == HOMOGRAPHY and m[2] @ np.append(column[:2], 1) <= 0:
+            out.append(np.inf)
+            continue
         e = error(column)
         out.append(e @ np.linalg.solve(jacobian @ jacobian.T, e))
     return np.array(out)
@@ -80,6 +85,140 @@ def test_the_best_model_is_that_of_the_exhaustive_search_despite_early_abandonme
     assert score == pytest.approx(scores.min())
     assert inliers == (table[index] < 0.01).sum()
     assert problem.best(models, loss, scores.min() * 0.999)[0] == -1
+
+
+def _still(count=400, wrong=0.6, noise=0.01, seed=0):
+    """Points that stay where they are to within noise, and strays: the true homography is the identity."""
+    rng = np.random.default_rng(seed)
+    x1 = rng.normal(size=(2, count))
+    strays = rng.uniform(size=count) < wrong
+    x2 = np.where(strays, rng.normal(size=(2, count)), x1 + noise * rng.normal(size=(2, count)))
+    return homography_matrix(np.concatenate([x1, x2]), 4 * noise), strays
+
+
+@pytest.mark.parametrize("wrong", [0.3, 0.8])
+def test_models_that_beat_the_bound_are_not_given_up_and_bad_ones_soon(wrong):
+    kept = []
+    for seed in range(200):
+        problem, _ = _still(wrong=wrong, seed=seed)
+        squares, square = np.full(problem.count, -1.0), problem.max_error**2
+        exact = problem.best(flat(np.eye(3))[None], TRUNCATED, np.inf)[1]
+        total, _ = score(problem.data, flat(np.eye(3)), TRUNCATED, square, 1.001 * exact, 3.0, squares)
+        kept.append(total == pytest.approx(exact))
+        moved_away = flat(np.eye(3) + [[0, 0, 5.0], [0, 0, 0], [0, 0, 0]])
+        assert score(problem.data, moved_away, TRUNCATED, square, exact, 3.0, squares)[0] == np.inf
+    assert np.mean(kept) > 0.97
+    squares[:] = -1.0
+    score(problem.data, moved_away, TRUNCATED, square, exact, 3.0, squares)
+    assert (squares >= 0).sum() < (40 if wrong == 0.3 else 250)
+
+
+def _twin_plausible(kind, data, m, sample):
+    """Both signs of depths along the rays for one sign of the matrix, by singular vectors."""
+    m = m.reshape(3, 3)
+    one = np.ones(len(sample))
+    first, second = (
+        (data[:3, sample], data[3:6, sample]) if kind == ESSENTIAL else (data[:2, sample], data[2:4, sample])
+    )
+    if kind != ESSENTIAL:
+        first, second = np.stack([*first, one]), np.stack([*second, one])
+    if kind == HOMOGRAPHY:
+        w = m[2] @ first
+        return ((w > 0).all() and np.linalg.det(m) > 0) or ((w < 0).all() and np.linalg.det(m) < 0)
+    t = np.linalg.svd(m)[0][:, 2]
+    sides = np.sum((m @ first) * np.cross(t, second.T).T, axis=0)
+    return (sides > 0).all() or (sides < 0).all()
+
+
+@pytest.mark.parametrize(("kind", "rows", "size"), [(ESSENTIAL, 18, 5), (FUNDAMENTAL, 4, 7), (HOMOGRAPHY, 4, 4)])
+def test_models_that_the_cameras_cannot_see_are_implausible(kind, rows, size):
+    rng = np.random.default_rng(4)
+    found = []
+    for _ in range(300):
+        data = rng.normal(size=(rows, 20))
+        problem = _problem(kind, data)
+        sample = rng.choice(20, size, replace=False)
+        # A matrix that is exact for the sample, so that the two directions are parallel.
+        models = problem.proposals(sample[None]) if kind != ESSENTIAL else flat(_rank_two(rng))[None]
+        for model in models:
+            expected = _twin_plausible(kind, data, model[:9], sample)
+            assert plausible(problem.data, model, sample) == expected
+            found.append(expected)
+            if kind == HOMOGRAPHY and expected:
+                assert (model[6:8] @ data[:2, sample] + model[8] > 0).all()
+    assert 0.001 < np.mean(found) < 0.4
+
+
+def test_true_models_are_plausible_for_every_sample():
+    for problem, model in _compiled()[2:3]:
+        assert plausible(problem.data, model, np.array([0, 5, 9, 30]))
+    rng = np.random.default_rng(7)
+    points = rng.uniform(-1, 1, (40, 3)) + [0, 0, 4]
+    rotation, t = np.linalg.qr(np.eye(3) + 0.1 * rng.normal(size=(3, 3)))[0], np.array([1.0, 0.1, 0.4])
+    rotation *= np.sign(np.diag(rotation))
+    skew = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    seen = points @ rotation.T + t
+    data = np.concatenate([(points[:, :2] / points[:, 2:]).T, (seen[:, :2] / seen[:, 2:]).T])
+    problem, model = fundamental_matrix(data, 1.0), flat(skew @ rotation)
+    assert all(plausible(problem.data, model, rng.choice(40, 7, replace=False)) for _ in range(50))
+
+
+@pytest.mark.parametrize("loss", [TRUNCATED, MARGINALIZED])
+def test_the_search_finds_what_its_slow_twin_finds(loss):
+    problem, _ = _still(count=200, seed=3)
+    samples = np.empty((100, 4), np.int64)
+    draw_samples(np.array([7]), 200, samples)
+
+    def truncated(model):
+        return problem.best(model[None], TRUNCATED, np.inf)[1]
+
+    best, bounds, model, used = [np.inf, np.inf], np.full(2, 200 * problem.max_error**2), np.zeros(SIZE), 0
+    expected = np.zeros(SIZE)
+    for first in range(0, 100, 20):
+        seen = [
+            proposal
+            for sample in samples[first : first + 20]
+            for proposal in problem.proposals(sample[None])
+            if plausible(problem.data, proposal, sample)
+        ]
+        winner = min(seen, key=truncated, default=None)
+        if winner is None or truncated(winner) >= best[0]:
+            continue
+        best[0] = truncated(winner)
+        refined = problem.improved(winner, loss, problem.max_error, 1e-2)
+        cost = problem.best(refined[None], loss, np.inf)[1]
+        if cost < best[1]:
+            best[1], expected = cost, refined
+    while used < 100:
+        used += problem.search(samples[used:], loss, bounds, model)[0]
+    np.testing.assert_allclose(bounds, best, rtol=1e-12)
+    np.testing.assert_allclose(model, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("quality", [None, np.arange(50.0)])
+def test_samples_are_the_same_however_many_are_taken_at_a_time(quality):
+    drawn = []
+    for portions in ([7] * 30, [1, 60, 13, 2] * 4):
+        sampler, rows = Sampler(50, 4, 1000, np.random.default_rng(1), quality), []
+        for most in portions:
+            some = sampler.ahead(most)
+            assert 0 < len(some) <= most
+            rows += some.tolist()
+            sampler.use(len(some))
+        assert sampler.used == len(rows)
+        drawn.append(rows)
+    shortest = min(map(len, drawn))
+    assert shortest > 50
+    assert drawn[0][:shortest] == drawn[1][:shortest]
+    if quality is not None:
+        # The best data have the highest numbers.
+        assert np.mean(drawn[0][:20]) > 40
+
+
+def test_scores_reach_over_bounds_of_the_noise_up_to_eight_pixels():
+    reached = {px: farthest_bound(RansacConfig(max_error_px=px)) * px for px in (0.5, 1.0, 2.0, 4.0, 12.0)}
+    assert reached == {0.5: 2.0, 1.0: 4.0, 2.0: 8.0, 4.0: 8.0, 12.0: 12.0}
+    assert farthest_bound(RansacConfig(max_error_px=1.0, score="truncated")) == 1.0
 
 
 def _rank_two(rng):

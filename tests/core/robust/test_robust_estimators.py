@@ -184,6 +184,41 @@ def test_fundamental_matrix_of_a_scene_with_a_dominant_plane_explains_what_lies_
     assert min(explained) > 0.85
 
 
+def test_homography_of_points_noisier_than_the_bound_is_as_good_as_with_a_bound_that_fits():
+    h = np.array([[1.1, 0.05, 30], [-0.02, 0.95, -20], [1e-5, -2e-5, 1]])
+    corners, errors = np.array([[0.0, 0], [1600, 0], [0, 1200], [1600, 1200]]), {}
+    for seed in range(15):
+        rng = _rng(seed)
+        p1 = rng.uniform(0, 1, (150, 2)) * SIZE
+        p2 = transform_points(h, p1) + rng.normal(size=p1.shape) * 2.0
+        p2[:75] = rng.uniform(0, 1, (75, 2)) * SIZE
+        for case in ((1.0, "marginalized"), (1.0, "truncated"), (6.0, "truncated")):
+            config = RansacConfig(max_error_px=case[0], score=case[1], min_inliers=8)
+            found = estimate_homography(p1, p2, config, rng=_rng(seed))
+            there = transform_points(found.matrix, corners) - transform_points(h, corners)
+            errors.setdefault(case, []).append(np.linalg.norm(there, axis=1).max())
+    tight, truncated, fitting = (np.median(e) for e in errors.values())
+    assert tight < 1.3 * fitting
+    assert tight < 0.6 * truncated
+
+
+def test_fundamental_matrix_is_found_among_seventy_per_cent_outliers():
+    found = []
+    for seed in range(10):
+        p1, p2, _, wrong = _two_views(PINHOLE, outliers=0.7, seed=seed)
+        estimate = estimate_fundamental(p1, p2, RansacConfig(max_error_px=1.0), rng=_rng(seed))
+        found.append(not isinstance(estimate, Rejected) and estimate.inliers[wrong:].mean() > 0.6)
+    # Two of 10,000 samples are clean: those of the inliers of other models find what is missing.
+    assert np.mean(found) == 1.0
+
+
+def test_a_mirrored_plane_is_none():
+    p1 = _rng(3).uniform(0, 1, (100, 2)) * SIZE
+    mirrored = p1 * [-1, 1] + [1600, 0]
+    assert isinstance(estimate_homography(p1, mirrored, rng=_rng()), Rejected)
+    assert estimate_homography(p1, SIZE - p1, rng=_rng()).inliers.all()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_homography_is_recovered_among_half_outliers_with_the_sign_of_visible_points(seed):
     rng = _rng(seed)
@@ -370,13 +405,15 @@ points = rng.uniform(-1, 1, (30, 3)) + [0, 0, 5]
 pose = Rigid3(Rotation3.exp(np.array([0.05, -0.2, 0.1])), np.array([1.0, 0.1, 0.2]))
 p1, p2 = camera.project(points)[0], camera.project(pose @ points)[0]
 p1, p2 = p1 + 0.3 * rng.normal(size=p1.shape), p2 + 0.3 * rng.normal(size=p2.shape)
-config = RansacConfig(min_iterations=5, max_iterations=5, min_inliers=8, max_error_px=3)
-out = []
-g = np.random.default_rng
-out.append(estimate_relative_pose(p1, p2, camera, camera, config, rng=g(1)).essential)
-out.append(estimate_fundamental(p1, p2, config, rng=g(1)).matrix)
-out.append(estimate_homography(p1, p1 + [3, 4], config, rng=g(1)).matrix)
-out.append(estimate_absolute_pose(p2, points, camera, config, rng=g(1)).cam_from_world.matrix)
+p2[:6] += 40 * rng.normal(size=(6, 2))
+out, g = [], np.random.default_rng
+for score, quality in (("truncated", None), ("marginalized", -np.abs(np.arange(30) - 14.2))):
+    config = RansacConfig(min_iterations=5, max_iterations=5, min_inliers=8, max_error_px=3, score=score)
+    chance = lambda: {"rng": g(1), "quality": quality}
+    out.append(estimate_relative_pose(p1, p2, camera, camera, config, **chance()).essential)
+    out.append(estimate_fundamental(p1, p2, config, **chance()).matrix)
+    out.append(estimate_homography(p1, p1 + [3, 4], config, **chance()).matrix)
+    out.append(estimate_absolute_pose(p2, points, camera, config, **chance()).cam_from_world.matrix)
 print(repr([m.ravel().tolist() for m in out]))
 """
 
@@ -393,5 +430,6 @@ def test_estimates_are_the_same_without_compilation():
         for disabled in ("0", "1")
     ]
     compiled, interpreted = (eval(text) for text in outputs)
+    assert len(compiled) == 8
     for a, b in zip(compiled, interpreted, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-9)

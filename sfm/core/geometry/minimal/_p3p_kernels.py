@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from sfm.core.geometry.minimal._polynomial_kernels import real_roots
+from sfm.core.geometry.minimal._cubic_kernels import cubic_roots
 
 MAX_SOLUTIONS = 4
 _POLISH_STEPS = 3
@@ -53,16 +53,19 @@ def _conics(cosines, squares, conics):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _line_pair(conics, d, lines):
-    """Fills `lines` with the best conditioned real line pair of the pencil; returns its parameter s, or NaN."""
-    adjugate, cubic, roots = np.empty((3, 3)), np.zeros(4), np.empty(10)
+def _line_pair(conics, d, lines, adjugate, cubic, roots):
+    """Fills `lines` with the best conditioned real line pair of the pencil; returns its parameter s, or NaN.
+
+    `d` and what comes after `lines` is scratch, here and below: taking memory for it costs as much as the solution.
+    """
+    cubic[:] = 0.0
     for n in range(2):
         cubic[3 * n] = _adjugate(conics[n], adjugate)
         for i in range(3):
             for j in range(3):
                 cubic[1 + n] += adjugate[i, j] * conics[1 - n, j, i]
     best, s, axis = 0.0, np.nan, 0
-    count = real_roots(cubic, roots)
+    count = cubic_roots(cubic, roots)
     for n in range(count + 1):
         root = roots[n] if n < count else s
         for i in range(3):
@@ -120,7 +123,7 @@ def _meet(line, conic, out):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scale_and_polish(d, cosines, squares):
+def _scale_and_polish(d, cosines, squares, residual, by_i, by_j):
     """Scales depths to the size of the triangle, then Newton steps on the laws of cosines; False if one is not > 0."""
     size = 0.0
     for k in range(3):
@@ -131,7 +134,6 @@ def _scale_and_polish(d, cosines, squares):
         scale = -scale
     for k in range(3):
         d[k] *= scale
-    residual, by_i, by_j = np.empty(3), np.empty(3), np.empty(3)
     for _ in range(_POLISH_STEPS):
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
@@ -182,6 +184,8 @@ def p3p(data, samples, poses):
     world, cam = np.empty((3, 3)), np.empty((3, 3))
     d, lines, depths = np.empty((3, 3)), np.empty((2, 3)), np.empty((2, 3))
     cosines, squares, conics = np.empty(3), np.empty(3), np.empty((2, 3, 3))
+    adjugate, cubic, roots = np.empty((3, 3)), np.empty(4), np.empty(10)
+    residual, by_i, by_j = np.empty(3), np.empty(3), np.empty(3)
     count = 0
     for sample in range(samples.shape[0]):
         for i in range(3):
@@ -196,12 +200,12 @@ def p3p(data, samples, poses):
                 cosines[k] += rays[i, m] * rays[j, m]
                 squares[k] += (points[i, m] - points[j, m]) * (points[i, m] - points[j, m])
         _conics(cosines, squares, conics)
-        s = _line_pair(conics, d, lines)
+        s = _line_pair(conics, d, lines, adjugate, cubic, roots)
         if not abs(s) < np.inf:
             continue
         for line in range(2):
             for n in range(_meet(lines[line], conics[1 if abs(s) < 1 else 0], depths)):
-                if not _scale_and_polish(depths[n], cosines, squares):
+                if not _scale_and_polish(depths[n], cosines, squares, residual, by_i, by_j):
                     continue
                 for i in range(3):
                     for j in range(3):

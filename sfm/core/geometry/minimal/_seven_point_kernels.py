@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from sfm.core.geometry.minimal._cubic_kernels import cubic_roots
 from sfm.core.geometry.minimal._linear_kernels import nullspace
-from sfm.core.geometry.minimal._polynomial_kernels import real_roots
 
 MAX_SOLUTIONS = 3
 
@@ -54,7 +54,7 @@ def seven_point(data, samples, fundamentals):
         minus = _determinant(mixed)
         c[2] = 0.5 * (plus + minus) - c[0]
         c[1] = 0.5 * (plus - minus) - c[3]
-        for k in range(real_roots(c, roots)):
+        for k in range(cubic_roots(c, roots)):
             norm = np.sqrt(1.0 + roots[k] * roots[k])
             for i in range(9):
                 fundamentals[count, i] = (basis[0, i] + roots[k] * basis[1, i]) / norm
