@@ -32,6 +32,8 @@ from sfm.core.geometry.minimal._polynomial_kernels import determinant, null_vect
 
 MAX_SOLUTIONS = 8
 _POLISH_STEPS = 5
+# Of the square of a step, after which another would change nothing, with exact data, or little, with noise.
+_AT_REST = 1e-9
 _ROTATION_STEPS = 4
 _SMALLEST_DETERMINANT = 0.1
 _MAX_ASPECT = 2.0
@@ -183,15 +185,22 @@ def _polish(q, g):
                 for j in range(4):
                     a[i, j] += row[i] * row[j]
         solve(a, step)
-        norm = 0.0
-        for i in range(4):
-            step[i] += g[i]
-            norm += step[i] * step[i]
-        norm = np.sqrt(norm)
-        if not norm < np.inf:
+        square = step[0] * step[0] + step[1] * step[1] + step[2] * step[2] + step[3] * step[3]
+        if not square < np.inf:
             return
+        # The step is orthogonal to g.
+        norm = np.sqrt(1.0 + square)
         for i in range(4):
-            g[i] = step[i] / norm
+            g[i] = (g[i] + step[i]) / norm
+        if square < _AT_REST:
+            return
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _combine(basis, g, p):
+    """p = Σ g_k P_k."""
+    for k in range(12):
+        p[k] = g[0] * basis[0, k] + g[1] * basis[1, k] + g[2] * basis[2, k] + g[3] * basis[3, k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -276,9 +285,12 @@ def p4pf(data, samples, models):
                 continue
             g[_CHARTS[chart, 0]], g[_CHARTS[chart, 1]] = x / norm, y / norm
             g[_CHARTS[chart, 2]], g[_CHARTS[chart, 3]] = roots[r] / norm, 1.0 / norm
+            # Most roots are of no camera in front of which the points lie, which shows before they are polished.
+            _combine(basis, g, p)
+            if not _in_front(data, samples[s], p, center, scale):
+                continue
             _polish(q, g)
-            for k in range(12):
-                p[k] = g[0] * basis[0, k] + g[1] * basis[1, k] + g[2] * basis[2, k] + g[3] * basis[3, k]
+            _combine(basis, g, p)
             if _in_front(data, samples[s], p, center, scale) and _pose(p, center, scale, models[count]):
                 count += 1
     return count

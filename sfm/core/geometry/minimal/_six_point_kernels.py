@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 
 from sfm.core.geometry.minimal._linear_kernels import nullspace, solve
-from sfm.core.geometry.minimal._polynomial_kernels import roots_within
+from sfm.core.geometry.minimal._polynomial_kernels import real_roots
 
 MAX_SHARED_SOLUTIONS, MAX_ONE_SIDED_SOLUTIONS = 15, 9
 _POLISH_STEPS = 4
@@ -236,7 +236,7 @@ def _six_point(data, sample, shared, nodes, powers, models):
     _constraints(forms, shared, c)
     _pencil_determinant(c, shared, nodes, powers, coefficients)
     count = 0
-    for r in range(roots_within(coefficients, roots)):
+    for r in range(real_roots(coefficients, roots, True)):
         w = (1.0 + roots[r]) / (1.0 - roots[r])
         for i in range(10):
             for k in range(10):

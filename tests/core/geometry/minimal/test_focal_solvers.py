@@ -9,7 +9,7 @@ import pytest
 
 from sfm.core.geometry.epipolar import essential_from_pose
 from sfm.core.geometry.minimal._linear_kernels import solve
-from sfm.core.geometry.minimal._polynomial_kernels import roots_within
+from sfm.core.geometry.minimal._polynomial_kernels import real_roots
 from sfm.core.geometry.minimal._six_point_kernels import _constraints
 from sfm.core.geometry.minimal.p4pf import solve_p4pf
 from sfm.core.geometry.minimal.six_point import solve_six_point_one_sided_focal, solve_six_point_shared_focal
@@ -214,8 +214,8 @@ def test_roots_within_the_unit_interval_are_those_of_the_companion_matrix():
         c = rng.normal(size=int(rng.integers(2, 17)))
         expected = np.roots(c[::-1])
         expected = np.sort(expected[(np.abs(expected.imag) < 1e-9) & (np.abs(expected.real) < 1)].real)
-        np.testing.assert_allclose(np.sort(out[: roots_within(c, out)]), expected, rtol=1e-6, atol=1e-8)
-    assert roots_within(np.zeros(5), out) == 0
+        np.testing.assert_allclose(np.sort(out[: real_roots(c, out, True)]), expected, rtol=1e-6, atol=1e-8)
+    assert real_roots(np.zeros(5), out, True) == 0
 
 
 _PROGRAM = """
