@@ -2,6 +2,7 @@
 
 from sfm.core.robust.absolute_pose import AbsolutePoseEstimate, estimate_absolute_pose, refine_absolute_pose
 from sfm.core.robust.alignment import align_robust
+from sfm.core.robust.focal_absolute_pose import estimate_absolute_pose_with_focal
 from sfm.core.robust.focal_pose import (
     FocalPoseEstimate,
     estimate_relative_pose_one_focal,
@@ -19,6 +20,7 @@ __all__ = [
     "RelativePoseEstimate",
     "align_robust",
     "estimate_absolute_pose",
+    "estimate_absolute_pose_with_focal",
     "estimate_fundamental",
     "estimate_homography",
     "estimate_relative_pose",

@@ -15,7 +15,6 @@ from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._loss_kernels import CAUCHY, TRUNCATED
 from sfm.core.robust._manifold_kernels import moved_pose
-from sfm.core.robust.focal_resection import focal_resection, state_of
 from sfm.core.robust.ransac import CompiledProblem, Estimate, RansacConfig, Solver, ransac
 from sfm.core.robust.refinement import polish, refine
 from sfm.core.robust.relative_pose import check_lengths, chosen, finite_rows, scatter
@@ -138,10 +137,9 @@ def estimate_absolute_pose(
 
     Sampling and refinement use tangent reprojection errors, in px for any camera model, which at 12 px differ from the
     exact ones by a hundredth at most; only points in front of their ray count. Inliers are those of the exact errors.
-    With `refine_focal` the camera's focal length is a guess. A perspective camera is sampled by P4Pf, whatever the
-    guess; with another, nine factors of it from 0.4 to 2.5 are tried by short runs and the best is sampled in full.
-    Pose and focal length are then refined together. A planar scene that is seen frontally leaves the focal length
-    undetermined.
+    With `refine_focal` the camera's focal length is a guess: nine factors from 0.4 to 2.5 are tried by short runs,
+    the best is sampled in full, and pose and focal length are refined together. A planar scene that is seen
+    frontally leaves the focal length undetermined.
 
     Args:
         points2D: (N, 2) px; points3D: (N, 3) their points in the world. Rows that are not finite are never inliers.
@@ -151,17 +149,14 @@ def estimate_absolute_pose(
     """
     check_lengths(points2D, points3D)
     refine_focal = refine_focal and bool(camera.model_info.focal_indices)
-    free_focal = refine_focal and not camera.model_info.is_fisheye
-    if free_focal:
-        problem, usable = focal_resection(points2D, points3D, camera, config.max_error_px)
-    else:
-        camera = _scanned_focal(points2D, points3D, camera, config, rng) if refine_focal else camera
-        problem, usable = resection(points2D, points3D, camera, config.max_error_px)
-    estimate = ransac(problem, config, rng, chosen(quality, usable))
+    if refine_focal:
+        camera = _scanned_focal(points2D, points3D, camera, config, rng)
+    tangent, usable = resection(points2D, points3D, camera, config.max_error_px)
+    estimate = ransac(tangent, config, rng, chosen(quality, usable))
     if not isinstance(estimate, Estimate):
         return estimate
     exact = ReprojectionProblem(points2D, points3D, camera, config.max_error_px, refine_focal=refine_focal)
-    state = state_of(estimate.model) if free_focal else exact.state(estimate.model)
+    state = exact.state(estimate.model)
     if refine_focal:
         state = polish(exact, refine(exact, state, TRUNCATED, config.max_error_px, _FOCAL_STEPS))
     inliers = scatter(exact.squared_errors(state) < config.max_error_px**2, exact.usable) & usable

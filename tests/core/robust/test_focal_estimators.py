@@ -15,7 +15,7 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.robust import (
     RansacConfig,
-    estimate_absolute_pose,
+    estimate_absolute_pose_with_focal,
     estimate_relative_pose_one_focal,
     estimate_relative_pose_shared_focal,
 )
@@ -23,7 +23,7 @@ from sfm.core.robust._focal_views_kernels import FocalViews
 from sfm.core.robust._loss_kernels import TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE, equations, model_of, moved, parameters, squared_errors, start
 from sfm.core.robust.focal import centered_pixels
-from sfm.core.robust.focal_resection import focal_resection, state_of
+from sfm.core.robust.focal_absolute_pose import focal_resection, state_of
 
 REFUSED = (ValueError, jaxtyping.TypeCheckError)
 FISHEYE = Camera("OPENCV_FISHEYE", 1600, 1200, np.array([500.0, 505, 800, 600, 0.02, -0.004, 0, 0]))
@@ -118,8 +118,8 @@ def test_exact_pairs_give_the_exact_focal_length():
 def test_an_absolute_pose_has_its_focal_length_whatever_the_guess_also_of_a_tilted_plane(thickness, factor):
     true = _camera(1700.0)
     pixels, points, pose, wrong = _views_of_points(true, thickness=thickness)
-    found = estimate_absolute_pose(
-        pixels, points, _camera(1700.0 * factor), CONFIG, rng=np.random.default_rng(0), refine_focal=True
+    found = estimate_absolute_pose_with_focal(
+        pixels, points, _camera(1700.0 * factor), CONFIG, rng=np.random.default_rng(0)
     )
     assert found.camera.mean_focal_length == pytest.approx(1700, rel=0.01)
     assert np.linalg.norm(found.cam_from_world.center - pose.center) < 0.05
@@ -131,13 +131,12 @@ def test_points_behind_the_camera_are_no_inliers_of_a_pose_with_unknown_focal_le
     true = _camera(1700.0)
     pixels, points, pose, _ = _views_of_points(true, outliers=0.0)
     behind = pose.inverse() @ -(pose @ points[:40])
-    found = estimate_absolute_pose(
+    found = estimate_absolute_pose_with_focal(
         np.concatenate([pixels, pixels[:40]]),
         np.concatenate([points, behind]),
         _camera(1200.0),
         CONFIG,
         rng=np.random.default_rng(0),
-        refine_focal=True,
     )
     assert found.inliers[:200].mean() > 0.97
     assert not found.inliers[200:].any()
@@ -155,6 +154,7 @@ def test_only_perspective_cameras_have_centered_pixels_and_they_are_those_of_a_p
     for estimate in (
         lambda: estimate_relative_pose_shared_focal(p, p, FISHEYE, rng=np.random.default_rng(0)),
         lambda: estimate_relative_pose_one_focal(p, p, _camera(900.0), FISHEYE, rng=np.random.default_rng(0)),
+        lambda: estimate_absolute_pose_with_focal(p, np.ones((20, 3)), FISHEYE, rng=np.random.default_rng(0)),
     ):
         with pytest.raises(ValueError, match="perspective"):
             estimate()
@@ -237,8 +237,8 @@ def _estimators():
     return {
         "shared": lambda a, b, rng: estimate_relative_pose_shared_focal(a, b, camera, config, rng=rng),
         "one-sided": lambda a, b, rng: estimate_relative_pose_one_focal(a, b, camera, camera, config, rng=rng),
-        "absolute": lambda a, b, rng: estimate_absolute_pose(
-            a, np.concatenate([b, 1e3 + b[:, :1]], axis=1), camera, config, rng=rng, refine_focal=True
+        "absolute": lambda a, b, rng: estimate_absolute_pose_with_focal(
+            a, np.concatenate([b, 1e3 + b[:, :1]], axis=1), camera, config, rng=rng
         ),
     }
 
@@ -294,7 +294,7 @@ from sfm.core.cameras import Camera
 from sfm.core.geometry.epipolar import essential_from_pose
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from sfm.core.robust import RansacConfig, estimate_absolute_pose
+from sfm.core.robust import RansacConfig, estimate_absolute_pose_with_focal
 from sfm.core.robust import estimate_relative_pose_one_focal, estimate_relative_pose_shared_focal
 camera = Camera("SIMPLE_PINHOLE", 1600, 1200, np.array([1300.0, 800, 600]))
 rng = np.random.default_rng(0)
@@ -307,7 +307,7 @@ config = RansacConfig(min_iterations=5, max_iterations=5, min_inliers=8, max_err
 g = np.random.default_rng
 shared = estimate_relative_pose_shared_focal(p1, p2, camera, config, rng=g(1))
 one = estimate_relative_pose_one_focal(p1, p2, camera, camera, config, rng=g(1))
-absolute = estimate_absolute_pose(p2, points, camera, config, rng=g(1), refine_focal=True)
+absolute = estimate_absolute_pose_with_focal(p2, points, camera, config, rng=g(1))
 out = [shared.cam2_from_cam1.matrix, shared.camera1.params, one.cam2_from_cam1.matrix, one.camera1.params]
 out += [absolute.cam_from_world.matrix, absolute.camera.params]
 print(repr([m.ravel().tolist() for m in out]))
