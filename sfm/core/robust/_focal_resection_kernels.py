@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sfm.core.geometry.minimal._p4pf_kernels import p4pf
 from sfm.core.robust._loss_kernels import robust_weight
 from sfm.core.robust._manifold_kernels import moved_pose
 
@@ -20,6 +21,15 @@ class FocalResection(NamedTuple):
     """The problem of a pose and a focal length: its columns (5, N), contiguous."""
 
     data: np.ndarray
+
+
+def solve(problem, samples, models):
+    return p4pf(problem.data, samples, models)
+
+
+def plausible(problem, model, sample):
+    """Always: the depths of the sample are positive."""
+    return True
 
 
 def squared_errors(problem, model, start, stop, out):

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sfm.core.geometry.minimal._six_point_kernels import six_point
 from sfm.core.robust import _manifold_kernels as manifold
 from sfm.core.robust._two_view_kernels import FUNDAMENTAL, TwoViews, epipolar_equations
 
@@ -25,6 +26,15 @@ class FocalViews(NamedTuple):
 
     shared: bool
     data: np.ndarray
+
+
+def solve(problem, samples, models):
+    return six_point(problem.data, samples, problem.shared, models)
+
+
+def plausible(problem, model, sample):
+    """Always: what is behind a camera shows in the end."""
+    return True
 
 
 def squared_errors(problem, model, start, stop, out):

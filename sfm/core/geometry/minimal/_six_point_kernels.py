@@ -255,23 +255,28 @@ def _six_point(data, sample, shared, nodes, powers, models):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def six_point_shared_focal(data, samples, models):
-    """Fills the rows of `models` (15 B, ≥ 10) with F (9) of unit norm and log f of samples of six; returns how many.
+def six_point(data, samples, shared, models):
+    """Fills the rows of `models` (15 or 9 B, ≥ 10) with F (9) of unit norm and log f of samples; returns how many.
 
     Columns of `data` are pairs of points from the principal points, x1, y1, x2, y2; rows of `samples` (B, 6) name
     columns. The unit is that of f and such that most coordinates lie within −1 … 1 and f is between 0.3 and 10: far
-    from there the determinant spans too many orders of magnitude.
+    from there the determinant spans too many orders of magnitude. If f is not shared, that of camera 2 is the unit.
     """
-    count = 0
+    nodes, powers, count = _SHARED_NODES, _SHARED_POWERS, 0
+    if not shared:
+        nodes, powers = _ONE_SIDED_NODES, _ONE_SIDED_POWERS
     for s in range(samples.shape[0]):
-        count += _six_point(data, samples[s], True, _SHARED_NODES, _SHARED_POWERS, models[count:])
+        count += _six_point(data, samples[s], shared, nodes, powers, models[count:])
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def six_point_shared_focal(data, samples, models):
+    """`six_point` for the focal length of both cameras."""
+    return six_point(data, samples, True, models)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def six_point_one_sided_focal(data, samples, models):
-    """As `six_point_shared_focal`, for `models` (9 B, ≥ 10) with f of camera 1; that of camera 2 is 1."""
-    count = 0
-    for s in range(samples.shape[0]):
-        count += _six_point(data, samples[s], False, _ONE_SIDED_NODES, _ONE_SIDED_POWERS, models[count:])
-    return count
+    """`six_point` for the focal length of camera 1."""
+    return six_point(data, samples, False, models)
