@@ -21,12 +21,19 @@ import functools
 
 from numba.extending import overload
 
-from sfm.core.robust import _absolute_pose_kernels, _two_view_kernels
+from sfm.core.robust import (
+    _absolute_pose_kernels,
+    _focal_resection_kernels,
+    _focal_views_kernels,
+    _two_view_kernels,
+)
 
 SIZE = 12
 _MODULES = {
     _two_view_kernels.TwoViews: _two_view_kernels,
     _absolute_pose_kernels.Resection: _absolute_pose_kernels,
+    _focal_views_kernels.FocalViews: _focal_views_kernels,
+    _focal_resection_kernels.FocalResection: _focal_resection_kernels,
 }
 
 

@@ -33,6 +33,8 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Mask, Vector
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.robust._absolute_pose_kernels import Resection
+from sfm.core.robust._focal_resection_kernels import FocalResection
+from sfm.core.robust._focal_views_kernels import FocalViews
 from sfm.core.robust._loop_kernels import best_model, improve, search
 from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE
@@ -102,7 +104,9 @@ class CompiledProblem:
     A model is a row of SIZE numbers, a matrix or a pose by rows and zeros.
     """
 
-    def __init__(self, data: TwoViews | Resection, solver: Solver, max_error: float) -> None:
+    def __init__(
+        self, data: TwoViews | Resection | FocalViews | FocalResection, solver: Solver, max_error: float
+    ) -> None:
         self.data, self.solver, self.max_error, self._some = data, solver, max_error, None
         self.sample_size, self.count = solver.sample_size, data.data.shape[1]
 

@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from sfm.core.geometry.minimal._linear_kernels import nullspace
-from sfm.core.geometry.minimal._polynomial_kernels import real_roots
+from sfm.core.geometry.minimal._polynomial_kernels import determinant, null_vector, real_roots
 
 MAX_SOLUTIONS = 10
 
@@ -139,45 +139,6 @@ def _action(a, b):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _determinant(b, det):
-    """det B(z), degree 10: the columns have degrees 3, 3 and 4."""
-    minor = np.empty(7)
-    for k in range(11):
-        det[k] = 0.0
-    for r in range(3):
-        p, q = (r + 1) % 3, (r + 2) % 3
-        for k in range(7):
-            minor[k] = 0.0
-        for i in range(4):
-            for j in range(4):
-                minor[i + j] += b[p, 0, i] * b[q, 1, j] - b[p, 1, i] * b[q, 0, j]
-        for i in range(7):
-            for j in range(5):
-                det[i + j] += minor[i] * b[r, 2, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _solve_xy(b, z):
-    """(x, y) with B(z) (x, y, 1)ᵀ = 0, from the pair of rows that determines it best."""
-    m = np.empty((3, 3))
-    for r in range(3):
-        for v in range(3):
-            f = b[r, v, 4]
-            for k in range(3, -1, -1):
-                f = f * z + b[r, v, k]
-            m[r, v] = f
-    best, x, y = 0.0, np.nan, np.nan
-    for r in range(3):
-        p, q = (r + 1) % 3, (r + 2) % 3
-        w = m[p, 0] * m[q, 1] - m[p, 1] * m[q, 0]
-        if abs(w) > best:
-            best = abs(w)
-            x = (m[p, 1] * m[q, 2] - m[p, 2] * m[q, 1]) / w
-            y = (m[p, 2] * m[q, 0] - m[p, 0] * m[q, 2]) / w
-    return x, y
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def five_point(data, samples, essentials):
     """Fills the rows of `essentials` (10 B, 9) with the E of ‖E‖ = √2 that fit samples of five; returns how many.
 
@@ -201,10 +162,10 @@ def five_point(data, samples, essentials):
         if not _eliminate(rows):
             continue
         _action(rows, b)
-        _determinant(b, det)
+        determinant(b, det)
         for r in range(real_roots(det, roots)):
             z = roots[r]
-            x, y = _solve_xy(b, z)
+            x, y = null_vector(b, z)
             norm = np.sqrt(0.5 * (x * x + y * y + z * z + 1.0))
             if norm < np.inf:
                 for i in range(9):

@@ -1,4 +1,4 @@
-"""Null spaces of small matrices by elimination with full pivoting."""
+"""Null spaces and solutions of small linear systems by elimination with pivoting."""
 
 from __future__ import annotations
 
@@ -60,3 +60,26 @@ def nullspace(a, basis):
                 else:
                     basis[i, j] /= np.sqrt(dot)
     return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(a, b):
+    """Puts the solution of a x = b in the place of `b`; destroys `a` (n, n). Not finite where it is singular."""
+    n = a.shape[0]
+    for k in range(n):
+        row = k
+        for i in range(k + 1, n):
+            if abs(a[i, k]) > abs(a[row, k]):
+                row = i
+        for j in range(k, n):
+            a[k, j], a[row, j] = a[row, j], a[k, j]
+        b[k], b[row] = b[row], b[k]
+        for i in range(k + 1, n):
+            factor = a[i, k] / a[k, k]
+            for j in range(k + 1, n):
+                a[i, j] -= factor * a[k, j]
+            b[i] -= factor * b[k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= a[k, j] * b[j]
+        b[k] /= a[k, k]
