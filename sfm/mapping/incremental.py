@@ -4,6 +4,8 @@
     while an image sees enough points:
         resect it → triangulate what it adds → adjust its neighbourhood
         when the model has grown by a tenth: adjust everything, complete tracks, drop what does not fit
+    while an image sees half as many, and nothing speaks against it (see `leftovers`):
+        resect it → triangulate → adjust its neighbourhood → keep it or undo all this → go on above
     adjust everything to convergence
 
 Images that are left start the next model. A model that folds two places onto each other (see `ambiguity`) is grown
@@ -30,6 +32,7 @@ from sfm.core.scene import PairKind, Reconstruction, ViewGraph
 from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
 from sfm.mapping.ambiguity import unfolded
 from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
+from sfm.mapping.leftovers import chance_doubt, loss_doubt, neighbour_doubt
 from sfm.mapping.registration import Resection, next_images, resect
 from sfm.mapping.state import MAX_PARAMS, Scene, State
 from sfm.mapping.tracks import build_tracks
@@ -56,6 +59,9 @@ class MappingConfig:
     """Points that must agree with a new pose."""
     resection_min_inlier_ratio: float = 0.25
     """Share of the visible points that must agree."""
+    leftover_min_inliers: int = 15
+    """Points that must agree with the pose of an image when no other can be registered any more; it then is held
+    against its matches with others and against chance, too. From `resection_min_inliers` on there is no such round."""
     resection_trials: int = 3
     """Attempts for an image; it is tried again only when it sees more points than before."""
     min_observations: int = 10
@@ -169,8 +175,19 @@ class _Mapper:
 
     def grow_model(self, state: State, used: np.ndarray) -> None:
         """Adds all images that fit and are not `used` to a model of two; what does not hold may fall apart again."""
-        images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
         tried_at: dict[int, list[int]] = {}
+        refused_at: dict[int, int] = {}
+        self.add_images(state, used, tried_at)
+        if self.leftovers(state, used, refused_at):
+            self.refine(state, rounds=2)
+            self.add_images(state, used, tried_at)
+            while self.register_leftover(state, used, refused_at):
+                self.add_images(state, used, tried_at)
+        self.refine(state, rounds=5, final=True)
+
+    def add_images(self, state: State, used: np.ndarray, tried_at: dict[int, list[int]]) -> None:
+        """Registers image after image with adjustments in between, until no more fits."""
+        images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
         registered = self.register_next(state, used, tried_at)
         while registered is not None:
             images, points = int(state.registered.sum()), int(state.has_point.sum())
@@ -183,7 +200,6 @@ class _Mapper:
             registered = self.register_next(state, used, tried_at)
             if registered is None and self.drop_misplaced_images(state):
                 registered = self.register_next(state, used, tried_at)
-        self.refine(state, rounds=5, final=True)
 
     def start_from_best_pair(self, used: np.ndarray, failed: set[tuple[int, int]]) -> tuple[State, InitialPair] | None:
         """A model of two images that are not `used`, by a pair that has not `failed`; None where no pair starts one.
@@ -249,6 +265,49 @@ class _Mapper:
                 self.triangulate_seen_by(state, np.array([image]))
                 return image
         return None
+
+    def leftovers(self, state: State, used: np.ndarray, refused_at: dict[int, int]) -> list[tuple[int, int]]:
+        """Images with the number of points that they see, enough for the last round and more than when refused."""
+        config = self.config
+        if config.leftover_min_inliers >= config.resection_min_inliers:
+            return []
+        candidates = next_images(state, config.leftover_min_inliers)
+        return [(image, n) for image, n in candidates if not used[image] and n > refused_at.get(image, 0)]
+
+    def register_leftover(self, state: State, used: np.ndarray, refused_at: dict[int, int]) -> bool:
+        """Registers an image that sees few points if nothing speaks against it; False where there is none."""
+        for image, visible in self.leftovers(state, used, refused_at):
+            before = state.copy()
+            outcome = self.judged_leftover(state, image, visible)
+            self.tell(state, image, outcome)
+            if isinstance(outcome, Resection):
+                return True
+            state.become(before)
+            refused_at[image] = visible
+        return False
+
+    def judged_leftover(self, state: State, image: int, visible: int) -> Resection | Rejected:
+        """Registers an image and adjusts its neighbourhood; rejected, with the state in disorder, where in doubt."""
+        config = self.config
+        outcome = resect(
+            state,
+            image,
+            max_error_px=config.resection_max_error_px,
+            min_inliers=config.leftover_min_inliers,
+            min_inlier_ratio=config.resection_min_inlier_ratio,
+            refine_focal=False,
+            rng=np.random.default_rng([self.seed, int(self.scene.image_ids[image]), visible, 1]),
+        )
+        if isinstance(outcome, Rejected):
+            return outcome
+        doubt = chance_doubt(state, image, config.resection_max_error_px)
+        if doubt is None:
+            self.triangulate_seen_by(state, np.array([image]))
+            self.adjust_around(state, image)
+            doubt = loss_doubt(state, image, config.leftover_min_inliers) or neighbour_doubt(
+                state, image, self.view_graph, config.max_error_px
+            )
+        return doubt or outcome
 
     def triangulate_seen_by(self, state: State, images: np.ndarray) -> None:
         """Makes and completes points on the tracks of these images."""

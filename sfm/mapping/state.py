@@ -166,6 +166,11 @@ class State:
         arrays = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return State(**{name: value if name == "scene" else value.copy() for name, value in arrays.items()})
 
+    def become(self, other: State) -> None:
+        """Takes over what another state knows; that one must not be used any more."""
+        for field in dataclasses.fields(self):
+            setattr(self, field.name, getattr(other, field.name))
+
     def camera(self, row: int) -> Camera:
         """The camera of a row as it stands now."""
         camera = self.scene.cameras[row]

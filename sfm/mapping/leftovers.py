@@ -1,0 +1,105 @@
+"""The last round: images that see too few points to be registered like the others.
+
+Thirty points that agree with a pose are asked for while a model grows, since all that follows is built on it. When
+nothing else fits any more, an image that sees half as many may still be certain. Three questions decide.
+
+Is it chance? Points that lie side by side are wrong together, so each cell of a grid over the image counts once. Of n
+cells with visible points k agree with the pose, each of which would by chance with probability α = π ε² / (w h). Among
+all choices of k cells and of the m that determine the pose, of which there are 4,
+
+    NFA = 4 (n − m) C(n, k) C(k, m) α^(k − m)
+
+agreements as good as this one are expected of random points.
+
+Do those agree that had no part in it? The matches with registered images, most of which belong to no point, have to
+lie on the epipolar lines of the new pose.
+
+Does it last? After adjustment with its neighbours the image must still hold as many points that two others see.
+
+Reference:
+    Moulon, Monasse & Marlet, Adaptive structure from motion with a contrario model estimation, ACCV 2012.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sfm.core.arrays import Mask
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from sfm.core.scene import TwoViewGeometry, ViewGraph
+from sfm.mapping.agreement import matches_on_epipolar_lines
+from sfm.mapping.state import State
+
+_GRID = 16
+_MAX_LOG10_FALSE_ALARMS = -6.0
+_SOLUTIONS, _SAMPLE = 4, 3
+_MIN_AGREEING_MATCHES = 0.5
+
+
+def log10_false_alarms(agreeing: int, visible: int, chance: float) -> float:
+    """log₁₀ of the number of poses that `agreeing` of `visible` random cells would agree with, see above."""
+    if agreeing <= _SAMPLE:
+        return math.inf
+    choices = math.comb(visible, agreeing) * math.comb(agreeing, _SAMPLE)
+    poses = _SOLUTIONS * (visible - _SAMPLE)
+    return math.log10(poses * choices) + (agreeing - _SAMPLE) * math.log10(chance)
+
+
+def chance_doubt(state: State, image: int, max_error_px: float) -> Rejected | None:
+    """Why the agreement of a newly registered image with the points that it sees may be chance; None: it is none."""
+    scene = state.scene
+    rows = scene.observations_of(image)
+    rows = rows[state.has_point[scene.track_of[rows]]]
+    size = scene.sizes[image]
+    column, row = (scene.xy[rows] / size * _GRID).astype(np.int64).clip(0, _GRID - 1).T
+    cells, cell_of = np.unique(row * _GRID + column, return_inverse=True)
+    # A cell agrees if half of its points do.
+    agreeing = int(np.sum(np.bincount(cell_of, weights=state.on[rows] - 0.5, minlength=len(cells)) >= 0))
+    chance = math.pi * max_error_px**2 / float(size.prod())
+    alarms = log10_false_alarms(agreeing, len(cells), min(chance, 1.0))
+    if alarms <= _MAX_LOG10_FALSE_ALARMS:
+        return None
+    return Rejected("maybe_chance", f"points agree in {agreeing} of {len(cells)} parts of the image only")
+
+
+def neighbour_doubt(state: State, image: int, view_graph: ViewGraph, max_error_px: float) -> Rejected | None:
+    """Whether most matches of a newly registered image with others contradict its pose."""
+    registered = set(state.scene.image_ids[state.registered].tolist())
+    mine = int(state.scene.image_ids[image])
+    agrees = [
+        _agreeing_matches(state, pair, geometry, max_error_px)
+        for pair, geometry in view_graph.pairs.items()
+        if mine in pair and registered.issuperset(pair)
+    ]
+    total, agreeing = sum(map(len, agrees)), int(sum(map(np.sum, agrees)))
+    if agreeing >= _MIN_AGREEING_MATCHES * total:
+        return None
+    return Rejected("contradicts_matches", f"{agreeing} of {total} matches with registered images agree")
+
+
+def _agreeing_matches(state: State, pair: tuple[int, int], geometry: TwoViewGeometry, max_error_px: float) -> Mask:
+    """Which matches of a pair of registered images, by id, agree with their poses."""
+    scene = state.scene
+    rows = np.searchsorted(scene.image_ids, pair).tolist()
+    pose1, pose2 = (Rigid3(Rotation3.from_matrix(state.R[row]), state.t[row]) for row in rows)
+    camera1, camera2 = (state.camera(int(scene.image_camera[row])) for row in rows)
+    points2D_1, points2D_2 = (scene.keypoints[i][geometry.matches[:, k]] for k, i in enumerate(pair))
+    return matches_on_epipolar_lines(pose2 @ pose1.inverse(), camera1, camera2, points2D_1, points2D_2, max_error_px)
+
+
+def loss_doubt(state: State, image: int, min_observations: int) -> Rejected | None:
+    """Whether adjustment left a newly registered image too few points that two other images see, or too small a share
+    of those that it should see.
+    """
+    scene = state.scene
+    rows = scene.observations_of(image)
+    rows = rows[state.has_point[scene.track_of[rows]]]
+    views = np.bincount(scene.track_of[state.on], minlength=len(state.has_point))
+    held = int(np.sum(state.on[rows] & (views[scene.track_of[rows]] >= 3)))
+    if held >= max(min_observations, 0.5 * len(rows)):
+        return None
+    return Rejected("lost_observations", f"{held} of {len(rows)} observations of points that two others see still fit")
