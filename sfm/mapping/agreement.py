@@ -8,6 +8,9 @@ from sfm.core.arrays import Mask, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.geometry.epipolar import essential_from_pose
 from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from sfm.core.scene import ViewGraph
+from sfm.mapping.state import State
 
 
 def matches_on_epipolar_lines(
@@ -30,3 +33,31 @@ def matches_on_epipolar_lines(
         pixel2 * np.linalg.norm(line_in_2[:, :2], axis=1), pixel1 * np.linalg.norm(line_in_1[:, :2], axis=1)
     )
     return np.abs(np.einsum("ni,ni->n", rays2, line_in_2)) <= max_error_px * gradient
+
+
+def count_agreeing_matches(
+    state: State, view_graph: ViewGraph, first: Mask, second: Mask, max_error_px: float
+) -> tuple[int, int]:
+    """How many matches between registered images of two groups agree with their poses, and how many there are.
+
+    Args:
+        first, second: (I,) which images are in which group.
+    """
+    scene = state.scene
+    group = first.astype(np.int64) - second
+    group[~state.registered] = 0
+    of_id = dict(zip(scene.image_ids.tolist(), zip(group.tolist(), range(len(group)), strict=True), strict=True))
+    agreeing, total = 0, 0
+    for (i, j), geometry in view_graph.pairs.items():
+        (group_of_i, row_i), (group_of_j, row_j) = of_id[i], of_id[j]
+        if group_of_i * group_of_j >= 0:
+            continue
+        pose1, pose2 = (Rigid3(Rotation3.from_matrix(state.R[row]), state.t[row]) for row in (row_i, row_j))
+        camera1, camera2 = (state.camera(int(scene.image_camera[row])) for row in (row_i, row_j))
+        points2D_1 = scene.keypoints[i][geometry.matches[:, 0]]
+        points2D_2 = scene.keypoints[j][geometry.matches[:, 1]]
+        agrees = matches_on_epipolar_lines(
+            pose2 @ pose1.inverse(), camera1, camera2, points2D_1, points2D_2, max_error_px
+        )
+        agreeing, total = agreeing + int(agrees.sum()), total + len(agrees)
+    return agreeing, total

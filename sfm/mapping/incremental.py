@@ -8,8 +8,9 @@
         resect it → triangulate → adjust its neighbourhood → keep it or undo all this → go on above
     adjust everything to convergence
 
-Images that are left start the next model. A model that folds two places onto each other (see `ambiguity`) is grown
-anew without the matches that mistake one for the other.
+Images that are left start the next model. Models that prove to lie in one world are joined (see `joining`). A model
+that folds two places onto each other (see `ambiguity`) is grown anew without the matches that mistake one for the
+other.
 
 Reference:
     Schönberger & Frahm, Structure-from-Motion Revisited, CVPR 2016.
@@ -32,7 +33,8 @@ from sfm.core.scene import PairKind, Reconstruction, ViewGraph
 from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
 from sfm.mapping.ambiguity import unfolded
 from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
-from sfm.mapping.leftovers import chance_doubt, loss_doubt, neighbour_doubt
+from sfm.mapping.joining import find_join, join_doubt, merged
+from sfm.mapping.leftovers import chance_doubt, loss_doubt, match_doubt
 from sfm.mapping.registration import Resection, next_images, resect
 from sfm.mapping.state import MAX_PARAMS, Scene, State
 from sfm.mapping.tracks import build_tracks
@@ -62,6 +64,8 @@ class MappingConfig:
     leftover_min_inliers: int = 15
     """Points that must agree with the pose of an image when no other can be registered any more; it then is held
     against its matches with others and against chance, too. From `resection_min_inliers` on there is no such round."""
+    join_min_tracks: int = 20
+    """Common tracks that must agree with how one model lies in another, so that both become one."""
     resection_trials: int = 3
     """Attempts for an image; it is tried again only when it sees more points than before."""
     min_observations: int = 10
@@ -169,6 +173,8 @@ class _Mapper:
                 states.append(state)
             else:  # grown from a wrong pair, nothing in it agreed in the end
                 failed.add((pair.image1, pair.image2))
+        states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
+        states = self.joined(states)
         states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
         kept = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
         return [state.to_reconstruction() for state in kept]
@@ -304,10 +310,47 @@ class _Mapper:
         if doubt is None:
             self.triangulate_seen_by(state, np.array([image]))
             self.adjust_around(state, image)
-            doubt = loss_doubt(state, image, config.leftover_min_inliers) or neighbour_doubt(
-                state, image, self.view_graph, config.max_error_px
-            )
-        return doubt or outcome
+            doubt = loss_doubt(state, image, config.leftover_min_inliers)
+        if doubt is None:
+            alone = np.arange(len(state.registered)) == image
+            doubt = match_doubt(state, alone, ~alone, self.view_graph, config.max_error_px)
+        return outcome if doubt is None else doubt
+
+    def joined(self, states: list[State]) -> list[State]:
+        """The models, where one of them lies in another's world as one of both, with the images that now fit."""
+        states, first = list(states), 0
+        while first < len(states):
+            for second in range(first + 1, len(states)):
+                if (both := self.join(states[first], states[second])) is not None:
+                    states[first] = both
+                    del states[second]
+                    others = np.zeros(len(both.registered), bool)
+                    for state in states:
+                        others |= state.registered
+                    self.grow_model(both, others & ~both.registered)
+                    break
+            else:
+                first += 1
+        return states
+
+    def join(self, a: State, b: State) -> State | None:
+        """One model of two that have enough tracks in common, adjusted; None where they do not fit."""
+        config, ids = self.config, self.scene.image_ids
+        rng = np.random.default_rng([self.seed, int(ids[a.registered][0]), int(ids[b.registered][0]), 2])
+        found = find_join(a, b, config.resection_max_error_px, config.join_min_tracks, rng)
+        if isinstance(found, Rejected):
+            return None
+        both = merged(a, b, found.a_from_b)
+        self.refine(both, rounds=3)
+        doubt = join_doubt(both, a.registered, b.registered, config.join_min_tracks)
+        if doubt is None:
+            doubt = match_doubt(both, a.registered, b.registered, self.view_graph, config.max_error_px)
+        sizes = f"models of {a.registered.sum()} and {b.registered.sum()} images"
+        if doubt is not None:
+            self.observer(Note(message=f"{sizes} stay apart: {doubt.detail}"))
+            return None
+        self.observer(Note(message=f"{sizes} joined by {found.agreeing} common tracks"))
+        return both
 
     def triangulate_seen_by(self, state: State, images: np.ndarray) -> None:
         """Makes and completes points on the tracks of these images."""

@@ -28,16 +28,15 @@ import numpy as np
 
 from sfm.core.arrays import Mask
 from sfm.core.errors import Rejected
-from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3
-from sfm.core.scene import TwoViewGeometry, ViewGraph
-from sfm.mapping.agreement import matches_on_epipolar_lines
+from sfm.core.scene import ViewGraph
+from sfm.mapping.agreement import count_agreeing_matches
 from sfm.mapping.state import State
 
 _GRID = 16
 _MAX_LOG10_FALSE_ALARMS = -6.0
 _SOLUTIONS, _SAMPLE = 4, 3
-_MIN_AGREEING_MATCHES = 0.5
+_MIN_AGREEING_POINTS = 0.5
+_MIN_AGREEING_MATCHES = 0.8
 
 
 def log10_false_alarms(agreeing: int, visible: int, chance: float) -> float:
@@ -66,40 +65,28 @@ def chance_doubt(state: State, image: int, max_error_px: float) -> Rejected | No
     return Rejected("maybe_chance", f"points agree in {agreeing} of {len(cells)} parts of the image only")
 
 
-def neighbour_doubt(state: State, image: int, view_graph: ViewGraph, max_error_px: float) -> Rejected | None:
-    """Whether most matches of a newly registered image with others contradict its pose."""
-    registered = set(state.scene.image_ids[state.registered].tolist())
-    mine = int(state.scene.image_ids[image])
-    agrees = [
-        _agreeing_matches(state, pair, geometry, max_error_px)
-        for pair, geometry in view_graph.pairs.items()
-        if mine in pair and registered.issuperset(pair)
-    ]
-    total, agreeing = sum(map(len, agrees)), int(sum(map(np.sum, agrees)))
+def match_doubt(state: State, first: Mask, second: Mask, view_graph: ViewGraph, max_error_px: float) -> Rejected | None:
+    """Whether too few of the matches between two groups of registered images agree with their poses.
+
+    Args:
+        first, second: (I,) which images are in which group, e.g. a new one and all others.
+    """
+    agreeing, total = count_agreeing_matches(state, view_graph, first, second, max_error_px)
     if agreeing >= _MIN_AGREEING_MATCHES * total:
         return None
-    return Rejected("contradicts_matches", f"{agreeing} of {total} matches with registered images agree")
-
-
-def _agreeing_matches(state: State, pair: tuple[int, int], geometry: TwoViewGeometry, max_error_px: float) -> Mask:
-    """Which matches of a pair of registered images, by id, agree with their poses."""
-    scene = state.scene
-    rows = np.searchsorted(scene.image_ids, pair).tolist()
-    pose1, pose2 = (Rigid3(Rotation3.from_matrix(state.R[row]), state.t[row]) for row in rows)
-    camera1, camera2 = (state.camera(int(scene.image_camera[row])) for row in rows)
-    points2D_1, points2D_2 = (scene.keypoints[i][geometry.matches[:, k]] for k, i in enumerate(pair))
-    return matches_on_epipolar_lines(pose2 @ pose1.inverse(), camera1, camera2, points2D_1, points2D_2, max_error_px)
+    return Rejected("contradicts_matches", f"{agreeing} of {total} matches between registered images agree")
 
 
 def loss_doubt(state: State, image: int, min_observations: int) -> Rejected | None:
-    """Whether adjustment left a newly registered image too few points that two other images see, or too small a share
-    of those that it should see.
+    """Whether adjustment left a newly registered image too few points that two others see, or too small a share of
+    those on its tracks.
     """
     scene = state.scene
-    rows = scene.observations_of(image)
-    rows = rows[state.has_point[scene.track_of[rows]]]
-    views = np.bincount(scene.track_of[state.on], minlength=len(state.has_point))
-    held = int(np.sum(state.on[rows] & (views[scene.track_of[rows]] >= 3)))
-    if held >= max(min_observations, 0.5 * len(rows)):
+    mine = scene.observations_of(image)
+    by_others = np.bincount(scene.track_of[state.on], minlength=len(state.has_point))
+    by_others[scene.track_of[mine[state.on[mine]]]] -= 1
+    seen = mine[by_others[scene.track_of[mine]] >= 2]
+    held = int(state.on[seen].sum())
+    if held >= max(min_observations, _MIN_AGREEING_POINTS * len(seen)):
         return None
-    return Rejected("lost_observations", f"{held} of {len(rows)} observations of points that two others see still fit")
+    return Rejected("lost_observations", f"{held} of {len(seen)} points that two others see still fit")
