@@ -35,27 +35,28 @@ def matches_on_epipolar_lines(
     return np.abs(np.einsum("ni,ni->n", rays2, line_in_2)) <= max_error_px * gradient
 
 
-def count_agreeing_matches(
+def agreement_of_unused_matches(
     state: State, view_graph: ViewGraph, first: Mask, second: Mask, max_error_px: float
 ) -> tuple[int, int]:
     """How many matches between registered images of two groups agree with their poses, and how many there are.
+
+    Matches of which both keypoints belong to points are left out, as the poses were made to agree with these.
 
     Args:
         first, second: (I,) which images are in which group.
     """
     scene = state.scene
-    group = first.astype(np.int64) - second
-    group[~state.registered] = 0
-    of_id = dict(zip(scene.image_ids.tolist(), zip(group.tolist(), range(len(group)), strict=True), strict=True))
+    group = np.where(state.registered, first.astype(np.int64) - second, 0)
     agreeing, total = 0, 0
-    for (i, j), geometry in view_graph.pairs.items():
-        (group_of_i, row_i), (group_of_j, row_j) = of_id[i], of_id[j]
-        if group_of_i * group_of_j >= 0:
+    for pair, geometry in view_graph.pairs.items():
+        rows = np.searchsorted(scene.image_ids, pair).tolist()
+        if group[rows[0]] * group[rows[1]] >= 0:
             continue
-        pose1, pose2 = (Rigid3(Rotation3.from_matrix(state.R[row]), state.t[row]) for row in (row_i, row_j))
-        camera1, camera2 = (state.camera(int(scene.image_camera[row])) for row in (row_i, row_j))
-        points2D_1 = scene.keypoints[i][geometry.matches[:, 0]]
-        points2D_2 = scene.keypoints[j][geometry.matches[:, 1]]
+        used = [state.has_observed(row)[geometry.matches[:, k]] for k, row in enumerate(rows)]
+        matches = geometry.matches[~(used[0] & used[1])]
+        pose1, pose2 = (Rigid3(Rotation3.from_matrix(state.R[row]), state.t[row]) for row in rows)
+        camera1, camera2 = (state.camera(int(scene.image_camera[row])) for row in rows)
+        points2D_1, points2D_2 = (scene.keypoints[i][matches[:, k]] for k, i in enumerate(pair))
         agrees = matches_on_epipolar_lines(
             pose2 @ pose1.inverse(), camera1, camera2, points2D_1, points2D_2, max_error_px
         )

@@ -28,6 +28,9 @@ _SAMPLES = 300
 _MIN_AGREEING_SHARE = 0.5
 _LOSS_SCALE_PX = 2.0
 _MAX_LOST_SHARE = 0.05
+_MIN_COMMON_SHARE = 0.6
+"""Points on common tracks that both models must see after adjustment. On thinned graphs of real photos 0.33 to 0.56 of
+them do where a join is wrong by 5° or more, and, but for one of 50, 0.64 or more where it is right."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -139,10 +142,19 @@ def join_doubt(state: State, first: np.ndarray, second: np.ndarray, min_common: 
     lost = int(np.sum((first | second) & ~state.registered))
     if lost > _MAX_LOST_SHARE * min(first.sum(), second.sum()):
         return Rejected("lost_images", f"{lost} images no longer fit where the models are joined")
-    seen = [np.zeros(len(state.has_point), bool) for _ in range(2)]
-    for side, images in zip(seen, (first, second), strict=True):
-        side[scene.track_of[state.on & images[scene.image]]] = True
-    common = int(np.sum(seen[0] & seen[1]))
-    if common < min_common:
-        return Rejected("few_common_points", f"{common} points are seen from both models, {min_common} needed")
+    reached, seen = (
+        _on_both_sides(scene.track_of, rows, first[scene.image], second[scene.image])
+        for rows in (state.registered[scene.image], state.on)
+    )
+    shared, common = int(np.sum(reached & state.has_point)), int(np.sum(seen))
+    if common < max(min_common, _MIN_COMMON_SHARE * shared):
+        return Rejected("few_common_points", f"{common} of {shared} points on common tracks fit both models")
     return None
+
+
+def _on_both_sides(track_of: np.ndarray, rows: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Which tracks (T,) have one of these observations in either group of images; all masks are over observations."""
+    tracks = int(track_of[-1]) + 1
+    return (np.bincount(track_of[rows & first], minlength=tracks) > 0) & (
+        np.bincount(track_of[rows & second], minlength=tracks) > 0
+    )

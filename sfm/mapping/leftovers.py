@@ -29,14 +29,15 @@ import numpy as np
 from sfm.core.arrays import Mask
 from sfm.core.errors import Rejected
 from sfm.core.scene import ViewGraph
-from sfm.mapping.agreement import count_agreeing_matches
+from sfm.mapping.agreement import agreement_of_unused_matches
 from sfm.mapping.state import State
 
 _GRID = 16
 _MAX_LOG10_FALSE_ALARMS = -6.0
 _SOLUTIONS, _SAMPLE = 4, 3
 _MIN_AGREEING_POINTS = 0.5
-_MIN_AGREEING_MATCHES = 0.8
+_MIN_UNUSED_MATCHES = 8
+_MIN_AGREEING_MATCHES = 0.5
 
 
 def log10_false_alarms(agreeing: int, visible: int, chance: float) -> float:
@@ -66,15 +67,15 @@ def chance_doubt(state: State, image: int, max_error_px: float) -> Rejected | No
 
 
 def match_doubt(state: State, first: Mask, second: Mask, view_graph: ViewGraph, max_error_px: float) -> Rejected | None:
-    """Whether too few of the matches between two groups of registered images agree with their poses.
+    """Whether the matches between two groups of registered images that had no part in their poses contradict them.
 
     Args:
         first, second: (I,) which images are in which group, e.g. a new one and all others.
     """
-    agreeing, total = count_agreeing_matches(state, view_graph, first, second, max_error_px)
-    if agreeing >= _MIN_AGREEING_MATCHES * total:
+    agreeing, total = agreement_of_unused_matches(state, view_graph, first, second, max_error_px)
+    if total < _MIN_UNUSED_MATCHES or agreeing >= _MIN_AGREEING_MATCHES * total:
         return None
-    return Rejected("contradicts_matches", f"{agreeing} of {total} matches between registered images agree")
+    return Rejected("contradicts_matches", f"{agreeing} of {total} matches that belong to no point agree")
 
 
 def loss_doubt(state: State, image: int, min_observations: int) -> Rejected | None:

@@ -204,6 +204,13 @@ class State:
         self.has_point[lost] = False
         self.on[np.isin(self.scene.track_of, lost)] = False
 
+    def has_observed(self, image: int) -> np.ndarray:
+        """Which keypoints (K,) of an image belong to points."""
+        rows = self.scene.observations_of(image)
+        observed = np.zeros(len(self.scene.keypoints[int(self.scene.image_ids[image])]), bool)
+        observed[self.scene.feature[rows[self.on[rows]]]] = True
+        return observed
+
     def registered_views(self) -> np.ndarray:
         """How many registered images each track has (T,)."""
         seen = self.registered[self.scene.image]
