@@ -282,30 +282,33 @@ class _Mapper:
 
     def register_leftover(self, state: State, used: np.ndarray, refused_at: dict[int, int]) -> bool:
         """Registers an image that sees few points if nothing speaks against it; False where there is none."""
+        config = self.config
         for image, visible in self.leftovers(state, used, refused_at):
-            before = state.copy()
-            outcome = self.judged_leftover(state, image, visible)
+            outcome = resect(
+                state,
+                image,
+                max_error_px=config.resection_max_error_px,
+                min_inliers=config.leftover_min_inliers,
+                min_inlier_ratio=config.resection_min_inlier_ratio,
+                refine_focal=False,  # which so few points do not determine
+                rng=np.random.default_rng([self.seed, int(self.scene.image_ids[image]), visible, 1]),
+            )
+            if isinstance(outcome, Resection):
+                before = state.copy()
+                doubt = self.settle_leftover(state, image)
+                if doubt is not None:
+                    state.become(before)
+                    state.unregister(image)
+                    outcome = doubt
             self.tell(state, image, outcome)
             if isinstance(outcome, Resection):
                 return True
-            state.become(before)
             refused_at[image] = visible
         return False
 
-    def judged_leftover(self, state: State, image: int, visible: int) -> Resection | Rejected:
-        """Registers an image and adjusts its neighbourhood; rejected, with the state in disorder, where in doubt."""
+    def settle_leftover(self, state: State, image: int) -> Rejected | None:
+        """Triangulates and adjusts what a newly registered image sees; why it had better be undone, if it had."""
         config = self.config
-        outcome = resect(
-            state,
-            image,
-            max_error_px=config.resection_max_error_px,
-            min_inliers=config.leftover_min_inliers,
-            min_inlier_ratio=config.resection_min_inlier_ratio,
-            refine_focal=False,
-            rng=np.random.default_rng([self.seed, int(self.scene.image_ids[image]), visible, 1]),
-        )
-        if isinstance(outcome, Rejected):
-            return outcome
         doubt = chance_doubt(state, image, config.resection_max_error_px)
         if doubt is None:
             self.triangulate_seen_by(state, np.array([image]))
@@ -314,7 +317,7 @@ class _Mapper:
         if doubt is None:
             alone = np.arange(len(state.registered)) == image
             doubt = match_doubt(state, alone, ~alone, self.view_graph, config.max_error_px)
-        return outcome if doubt is None else doubt
+        return doubt
 
     def joined(self, states: list[State]) -> list[State]:
         """The models, where one of them lies in another's world as one of both, with the images that now fit."""

@@ -11,7 +11,7 @@ all choices of k cells and of the m that determine the pose, of which there are 
 
 agreements as good as this one are expected of random points.
 
-Do those agree that had no part in it? The matches with registered images, most of which belong to no point, have to
+Do those agree that had no part in it? Most matches with registered images belong to no point; half of these have to
 lie on the epipolar lines of the new pose.
 
 Does it last? After adjustment with its neighbours the image must still hold as many points that two others see.
@@ -33,11 +33,14 @@ from sfm.mapping.agreement import agreement_of_unused_matches
 from sfm.mapping.state import State
 
 _GRID = 16
-_MAX_LOG10_FALSE_ALARMS = -6.0
 _SOLUTIONS, _SAMPLE = 4, 3
+_MAX_LOG10_FALSE_ALARMS = -6.0
+"""At 12 px in a photo of 1024 × 768, six cells of six, or eight of sixteen."""
 _MIN_AGREEING_POINTS = 0.5
 _MIN_UNUSED_MATCHES = 8
 _MIN_AGREEING_MATCHES = 0.5
+"""On thinned graphs of real photos 0.63 or more agree where the pose is right, 0.06 to 0.46 where it is 2° or more off;
+from fewer than eight matches nothing is concluded."""
 
 
 def log10_false_alarms(agreeing: int, visible: int, chance: float) -> float:
