@@ -26,8 +26,8 @@ import dataclasses
 import numpy as np
 
 from sfm.core.arrays import FloatArray
-from sfm.core.geometry.epipolar import essential_from_pose
 from sfm.core.scene import Reconstruction, TwoViewGeometry, ViewGraph
+from sfm.mapping.agreement import matches_on_epipolar_lines
 
 Pair = tuple[int, int]
 
@@ -94,19 +94,12 @@ def contradictions(view_graph: ViewGraph, model: Reconstruction) -> set[Pair]:
 
 def _consistent_share(model: Reconstruction, a: int, b: int, geometry: TwoViewGeometry) -> float:
     """Share of a pair's matches within `_CONSISTENT_PX` of the epipolar lines of the model's poses."""
-    rays, pixel = [], []
-    for image, column in ((a, 0), (b, 1)):
-        camera = model.cameras[int(model.image_camera_ids[image])]
-        first, last = model.keypoint_offsets[image : image + 2]
-        rays.append(camera.unproject(model.keypoints[first:last][geometry.matches[:, column]])[0])
-        pixel.append(1 / camera.mean_focal_length)
-    essential = essential_from_pose(model.cams_from_world[b] @ model.cams_from_world[a].inverse())
-    line_in_b, line_in_a = rays[0] @ essential.T, rays[1] @ essential
-    gradient = np.hypot(
-        pixel[1] * np.linalg.norm(line_in_b[:, :2], axis=1), pixel[0] * np.linalg.norm(line_in_a[:, :2], axis=1)
+    camera1, camera2 = (model.cameras[int(model.image_camera_ids[image])] for image in (a, b))
+    points2D_1, points2D_2 = (
+        model.keypoints[model.keypoint_offsets[image] + geometry.matches[:, k]] for k, image in enumerate((a, b))
     )
-    error = np.abs(np.einsum("ni,ni->n", rays[1], line_in_b))
-    return float(np.mean(error <= _CONSISTENT_PX * gradient))
+    b_from_a = model.cams_from_world[b] @ model.cams_from_world[a].inverse()
+    return float(np.mean(matches_on_epipolar_lines(b_from_a, camera1, camera2, points2D_1, points2D_2, _CONSISTENT_PX)))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -4,10 +4,13 @@
     while an image sees enough points:
         resect it → triangulate what it adds → adjust its neighbourhood
         when the model has grown by a tenth: adjust everything, complete tracks, drop what does not fit
+    while an image sees half as many, and nothing speaks against it (see `leftovers`):
+        resect it → triangulate → adjust its neighbourhood → keep it or undo all this → go on above
     adjust everything to convergence
 
-Images that are left start the next model. A model that folds two places onto each other (see `ambiguity`) is grown
-anew without the matches that mistake one for the other.
+Images that are left start the next model. Models that prove to lie in one world are joined (see `joining`). A model
+that folds two places onto each other (see `ambiguity`) is grown anew without the matches that mistake one for the
+other.
 
 Reference:
     Schönberger & Frahm, Structure-from-Motion Revisited, CVPR 2016.
@@ -30,6 +33,8 @@ from sfm.core.scene import PairKind, Reconstruction, ViewGraph
 from sfm.mapping.adjustment import adjust_globally, adjust_locally, has_bogus_params, neighbourhood
 from sfm.mapping.ambiguity import unfolded
 from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initial_pairs
+from sfm.mapping.joining import find_join, join_doubt, merged
+from sfm.mapping.leftovers import chance_doubt, loss_doubt, match_doubt
 from sfm.mapping.registration import Resection, next_images, resect
 from sfm.mapping.state import MAX_PARAMS, Scene, State
 from sfm.mapping.tracks import build_tracks
@@ -56,6 +61,11 @@ class MappingConfig:
     """Points that must agree with a new pose."""
     resection_min_inlier_ratio: float = 0.25
     """Share of the visible points that must agree."""
+    leftover_min_inliers: int = 15
+    """Points that must agree with the pose of an image when no other can be registered any more; it then is held
+    against its matches with others and against chance, too. From `resection_min_inliers` on there is no such round."""
+    join_min_tracks: int = 20
+    """Common tracks that must agree with how one model lies in another, so that both become one."""
     resection_trials: int = 3
     """Attempts for an image; it is tried again only when it sees more points than before."""
     min_observations: int = 10
@@ -164,13 +174,26 @@ class _Mapper:
             else:  # grown from a wrong pair, nothing in it agreed in the end
                 failed.add((pair.image1, pair.image2))
         states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
+        states = self.joined(states)
+        states.sort(key=lambda s: (-s.registered.sum(), -s.has_point.sum()))
         kept = [s for k, s in enumerate(states) if k == 0 or s.registered.sum() >= self.config.min_model_images]
         return [state.to_reconstruction() for state in kept]
 
     def grow_model(self, state: State, used: np.ndarray) -> None:
         """Adds all images that fit and are not `used` to a model of two; what does not hold may fall apart again."""
-        images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
         tried_at: dict[int, list[int]] = {}
+        refused_at: dict[int, int] = {}
+        self.add_images(state, used, tried_at)
+        if self.leftovers(state, used, refused_at):
+            self.refine(state, rounds=2)
+            self.add_images(state, used, tried_at)
+            while self.register_leftover(state, used, refused_at):
+                self.add_images(state, used, tried_at)
+        self.refine(state, rounds=5, final=True)
+
+    def add_images(self, state: State, used: np.ndarray, tried_at: dict[int, list[int]]) -> None:
+        """Registers image after image with adjustments in between, until no more fits."""
+        images_then, points_then = int(state.registered.sum()), int(state.has_point.sum())
         registered = self.register_next(state, used, tried_at)
         while registered is not None:
             images, points = int(state.registered.sum()), int(state.has_point.sum())
@@ -183,7 +206,6 @@ class _Mapper:
             registered = self.register_next(state, used, tried_at)
             if registered is None and self.drop_misplaced_images(state):
                 registered = self.register_next(state, used, tried_at)
-        self.refine(state, rounds=5, final=True)
 
     def start_from_best_pair(self, used: np.ndarray, failed: set[tuple[int, int]]) -> tuple[State, InitialPair] | None:
         """A model of two images that are not `used`, by a pair that has not `failed`; None where no pair starts one.
@@ -249,6 +271,89 @@ class _Mapper:
                 self.triangulate_seen_by(state, np.array([image]))
                 return image
         return None
+
+    def leftovers(self, state: State, used: np.ndarray, refused_at: dict[int, int]) -> list[tuple[int, int]]:
+        """Images with the number of points that they see, enough for the last round and more than when refused."""
+        config = self.config
+        if config.leftover_min_inliers >= config.resection_min_inliers:
+            return []
+        candidates = next_images(state, config.leftover_min_inliers)
+        return [(image, n) for image, n in candidates if not used[image] and n > refused_at.get(image, 0)]
+
+    def register_leftover(self, state: State, used: np.ndarray, refused_at: dict[int, int]) -> bool:
+        """Registers an image that sees few points if nothing speaks against it; False where there is none."""
+        config = self.config
+        for image, visible in self.leftovers(state, used, refused_at):
+            outcome = resect(
+                state,
+                image,
+                max_error_px=config.resection_max_error_px,
+                min_inliers=config.leftover_min_inliers,
+                min_inlier_ratio=config.resection_min_inlier_ratio,
+                refine_focal=False,  # which so few points do not determine
+                rng=np.random.default_rng([self.seed, int(self.scene.image_ids[image]), visible, 1]),
+            )
+            if isinstance(outcome, Resection):
+                before = state.copy()
+                doubt = self.settle_leftover(state, image)
+                if doubt is not None:
+                    state.become(before)
+                    state.unregister(image)
+                    outcome = doubt
+            self.tell(state, image, outcome)
+            if isinstance(outcome, Resection):
+                return True
+            refused_at[image] = visible
+        return False
+
+    def settle_leftover(self, state: State, image: int) -> Rejected | None:
+        """Triangulates and adjusts what a newly registered image sees; why it had better be undone, if it had."""
+        config = self.config
+        doubt = chance_doubt(state, image, config.resection_max_error_px)
+        if doubt is None:
+            self.triangulate_seen_by(state, np.array([image]))
+            self.adjust_around(state, image)
+            doubt = loss_doubt(state, image, config.leftover_min_inliers)
+        if doubt is None:
+            alone = np.arange(len(state.registered)) == image
+            doubt = match_doubt(state, alone, ~alone, self.view_graph, config.max_error_px)
+        return doubt
+
+    def joined(self, states: list[State]) -> list[State]:
+        """The models, where one of them lies in another's world as one of both, with the images that now fit."""
+        states, first = list(states), 0
+        while first < len(states):
+            for second in range(first + 1, len(states)):
+                if (both := self.join(states[first], states[second])) is not None:
+                    states[first] = both
+                    del states[second]
+                    others = np.zeros(len(both.registered), bool)
+                    for state in states:
+                        others |= state.registered
+                    self.grow_model(both, others & ~both.registered)
+                    break
+            else:
+                first += 1
+        return states
+
+    def join(self, a: State, b: State) -> State | None:
+        """One model of two that have enough tracks in common, adjusted; None where they do not fit."""
+        config, ids = self.config, self.scene.image_ids
+        rng = np.random.default_rng([self.seed, int(ids[a.registered][0]), int(ids[b.registered][0]), 2])
+        found = find_join(a, b, config.resection_max_error_px, config.join_min_tracks, rng)
+        if isinstance(found, Rejected):
+            return None
+        both = merged(a, b, found.a_from_b)
+        self.refine(both, rounds=3)
+        doubt = join_doubt(both, a.registered, b.registered, config.join_min_tracks)
+        if doubt is None:
+            doubt = match_doubt(both, a.registered, b.registered, self.view_graph, config.max_error_px)
+        sizes = f"models of {a.registered.sum()} and {b.registered.sum()} images"
+        if doubt is not None:
+            self.observer(Note(message=f"{sizes} stay apart: {doubt.detail}"))
+            return None
+        self.observer(Note(message=f"{sizes} joined by {found.agreeing} common tracks"))
+        return both
 
     def triangulate_seen_by(self, state: State, images: np.ndarray) -> None:
         """Makes and completes points on the tracks of these images."""

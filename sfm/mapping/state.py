@@ -166,6 +166,11 @@ class State:
         arrays = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return State(**{name: value if name == "scene" else value.copy() for name, value in arrays.items()})
 
+    def become(self, other: State) -> None:
+        """Takes over what another state knows; that one must not be used any more."""
+        for field in dataclasses.fields(self):
+            setattr(self, field.name, getattr(other, field.name))
+
     def camera(self, row: int) -> Camera:
         """The camera of a row as it stands now."""
         camera = self.scene.cameras[row]
@@ -198,6 +203,13 @@ class State:
         lost = tracks[seen[tracks] < 2]
         self.has_point[lost] = False
         self.on[np.isin(self.scene.track_of, lost)] = False
+
+    def has_observed(self, image: int) -> np.ndarray:
+        """Which keypoints (K,) of an image belong to points."""
+        rows = self.scene.observations_of(image)
+        observed = np.zeros(len(self.scene.keypoints[int(self.scene.image_ids[image])]), bool)
+        observed[self.scene.feature[rows[self.on[rows]]]] = True
+        return observed
 
     def registered_views(self) -> np.ndarray:
         """How many registered images each track has (T,)."""

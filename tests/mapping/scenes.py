@@ -6,6 +6,8 @@ from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
+from sfm.mapping import build_tracks
+from sfm.mapping.state import Scene
 
 
 def look_at(center: np.ndarray, target: np.ndarray) -> Rigid3:
@@ -47,3 +49,17 @@ class PointScene:
         self.cameras = {1: self.camera}
         self.image_cameras = dict.fromkeys(self.keypoints, 1)
         self.image_names = {i: f"{i:03d}.jpg" for i in self.keypoints}
+
+    def keep_matches(self, kept) -> None:
+        """Drops matches: `kept(i, j, points)` says of the points (M,) of a pair of images which stay matched."""
+        pairs = {}
+        for (i, j), geometry in self.view_graph.pairs.items():
+            stays = kept(i, j, self.order[i][geometry.matches[:, 0]])
+            if stays.any():
+                pairs[i, j] = TwoViewGeometry(geometry.kind, geometry.matches[stays], geometry.cam2_from_cam1)
+        self.view_graph = ViewGraph(pairs)
+
+    def rows(self) -> Scene:
+        """The scene in the rows that the mapper works on."""
+        tracks = build_tracks(self.view_graph, self.keypoints, min_length=2)
+        return Scene.build(tracks, self.keypoints, self.cameras, self.image_cameras, self.image_names)
