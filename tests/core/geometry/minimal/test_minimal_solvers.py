@@ -52,6 +52,23 @@ def test_real_roots_at_the_borders_of_the_unit_interval_and_of_every_size_are_fo
     np.testing.assert_allclose(np.sort(out[:count]), np.sort(roots), rtol=1e-6, atol=1e-10)
 
 
+@pytest.mark.parametrize("smallest", [0.0, 1e-18])
+def test_a_leading_coefficient_of_nearly_zero_changes_no_root(smallest):
+    rng = np.random.default_rng(9)
+    out = np.empty(10)
+    for degree in (2, 3, 5, 9):
+        roots = np.sort(rng.uniform(-3, 3, degree))
+        count = real_roots(np.append(np.poly(roots)[::-1], smallest), out)
+        np.testing.assert_allclose(np.sort(out[:count]), roots, rtol=1e-5, atol=1e-6)
+
+
+def test_simple_roots_are_found_beside_a_multiple_one():
+    out = np.empty(10)
+    count = real_roots(np.poly([0.7, 0.7, 0.7, -2.0, 0.1])[::-1].copy(), out)
+    for root in (-2.0, 0.1):
+        assert np.abs(out[:count] - root).min() < 1e-6
+
+
 @pytest.mark.parametrize("c", [np.zeros(4), np.array([1.0, np.nan, 0, 1]), np.array([1.0, 0, 1, 0])])
 def test_polynomials_without_real_roots_have_none(c):
     assert real_roots(c, np.empty(10)) == 0
