@@ -5,14 +5,16 @@ rejects most, but lets those pass of which noise has made one tile the nearest, 
 geometry that is off by whole tiles. So they prove nothing; what has no look-alikes does.
 
 Of photos of buildings, statues, rooms and roads up to 15 % of the features have look-alikes (208 photos of 17 sets, the
-median of each set is below 10 %), of photos of chessboards and circle grids 20 to 97 %, and of rendered walls of equal
-tiles, bricks or windows 78 to 100 %, even where noise of σ = 8 grey values lies over them.
+median of each set is below 10 %), of photos that show calibration boards 5 to 97 %, and of rendered walls of equal
+tiles, bricks or windows 78 to 100 %, even where noise of σ = 8 grey values lies over them. To find that an image does
+not repeat itself takes 12 ms for 12,000 features.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
+from scipy.spatial import KDTree
 
 from sfm.core.arrays import Mask
 from sfm.core.scene import DescriptorKind, Features
@@ -27,14 +29,18 @@ _APART = 3.0
 """Features nearer than this multiple of σ are one thing twice: a keypoint of two orientations or scales."""
 _REACH = 6.0
 """Half the width of SIFT's descriptor, as a multiple of σ."""
+_NEIGHBORS, _LONE = 8, 0.5
+"""Of so many nearest features, itself included, this share must have no look-alikes either. Which of the weak keypoints
+of a tile are found depends on how its pixels fall: without this, up to 28 matches of photos that differ by a step along
+a row are of such keypoints, all on their epipolar lines; with it, none of 90 pairs has 15."""
 _BLOCK_ROWS = 256
 
 
 def distinct_features(features: Features, width: int, height: int) -> Mask | None:
     """Which features nothing else in their image looks like; None where the image does not repeat itself.
 
-    Features whose surroundings the border of the image cuts off differ from their look-alikes for that alone, and are
-    not distinct either. Descriptors other than SIFT's are not judged.
+    Not distinct either are those whose surroundings the border of the image cuts off, which makes them differ from
+    their look-alikes, and lone ones among features with look-alikes. Descriptors other than SIFT's are not judged.
 
     Args:
         width, height: of the image in px.
@@ -50,7 +56,9 @@ def distinct_features(features: Features, width: int, height: int) -> Mask | Non
     blocks = (np.arange(start, min(start + _BLOCK_ROWS, count)) for start in range(0, count, _BLOCK_ROWS))
     repeated = np.concatenate([_have_look_alikes(features, table, half_squared, rows) for rows in blocks])
     margin = np.minimum(features.points2D, [width, height] - features.points2D).min(axis=1)
-    return ~repeated & (margin > _REACH * features.scales)
+    distinct = ~repeated & (margin > _REACH * features.scales)
+    _, neighbors = KDTree(features.points2D).query(features.points2D, k=min(count, _NEIGHBORS))
+    return distinct & (distinct[neighbors].mean(axis=1) >= _LONE)
 
 
 def _have_look_alikes(

@@ -78,7 +78,9 @@ def verify_pair(
     return Rejected("repeated_texture", f"{agreeing} of {distinct.sum()} distinct matches agree")
 
 
-def _distinct(matches: Matches, distinct1: Mask | None, distinct2: Mask | None) -> Mask:
+def _distinct(
+    matches: Matches, distinct1: Bool[np.ndarray, " N1"] | None, distinct2: Bool[np.ndarray, " N2"] | None
+) -> Mask:
     """The matches of which both keypoints are distinct."""
     keep = np.ones(len(matches), np.bool_)
     for column, distinct in enumerate((distinct1, distinct2)):

@@ -103,9 +103,9 @@ def test_a_homography_brings_in_the_tiles_that_it_puts_where_they_are():
     assert not kept[~pair.right].any()
 
 
-@pytest.mark.parametrize(("wrong", "verified"), [(0, True), (10, True), (25, False)])
+@pytest.mark.parametrize(("wrong", "verified"), [(0, True), (20, True), (36, False)])
 def test_distinct_matches_that_agree_must_outnumber_the_others(wrong, verified):
-    """40 against 25 lead by 15 only; of which chance may bring some to agree."""
+    """40 against 36 lead by 4 only, and some of those agree by chance."""
     found = Pair(tiles=30, off=(2, 0), others=40, wrong=wrong).verified()
     assert isinstance(found, TwoViewGeometry) == verified
     assert verified or (isinstance(found, Rejected) and found.reason == "repeated_texture")
