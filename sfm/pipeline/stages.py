@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,7 +23,14 @@ from sfm.core.scene import Features, Matches, PairKind, TwoViewGeometry
 from sfm.features import NETWORKS, working_memory_bytes
 from sfm.io.database import Database
 from sfm.io.images import natural_key
-from sfm.matching import LightGlue, MatchingConfig, SearchableFeatures, match_features, match_guided
+from sfm.matching import (
+    LightGlue,
+    MatchingConfig,
+    SearchableFeatures,
+    distinct_features,
+    match_features,
+    match_guided,
+)
 from sfm.pipeline.config import PipelineConfig
 from sfm.pipeline.image_features import STAGE as FEATURES
 from sfm.pipeline.image_features import FoundFeatures, SceneImage, find_features, follow_features, model_digest
@@ -43,6 +50,8 @@ _GUIDING = (PairKind.CALIBRATED, PairKind.UNCALIBRATED)
 _MEMORY_GUESS_BYTES = 8 * 1024**3
 
 Pair = tuple[int, int]
+_Matched = tuple[Pair, np.ndarray, np.ndarray, Matches, tuple[np.ndarray | None, np.ndarray | None], list[Features]]
+"""Keypoints of both images, matches, which keypoints are distinct, and descriptors if they are needed."""
 Result = TypeVar("Result")
 Item = TypeVar("Item", int, Pair)
 
@@ -186,20 +195,25 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     points2D = lru_cache(_CACHED_IMAGES)(run.database.read_keypoints)
     features = lru_cache(_CACHED_IMAGES)(run.database.read_features)
 
-    def inputs() -> Iterator[tuple[Pair, np.ndarray, np.ndarray, Matches, list[Features]]]:
-        for i, j in _tiled(stale):
-            described = [features(i), features(j)] if guided else []
-            yield (i, j), points2D(i), points2D(j), run.database.read_matches(i, j), described
+    @cache
+    def distinct(image_id: int) -> np.ndarray | None:
+        camera = run.images[image_id].camera
+        return distinct_features(run.database.read_features(image_id), camera.width, camera.height)
 
-    def compute(
-        item: tuple[Pair, np.ndarray, np.ndarray, Matches, list[Features]],
-    ) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
-        pair, points2D_1, points2D_2, matches, described = item
+    def inputs() -> Iterator[_Matched]:
+        for i, j in _tiled(stale):
+            matches, described = run.database.read_matches(i, j), [features(i), features(j)] if guided else []
+            worth_it = config.detect_repetition and len(matches) >= config.ransac.min_inliers
+            masks = (distinct(i), distinct(j)) if worth_it else (None, None)
+            yield (i, j), points2D(i), points2D(j), matches, masks, described
+
+    def compute(item: _Matched) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
+        pair, points2D_1, points2D_2, matches, (distinct1, distinct2), described = item
         camera1, camera2 = run.images[pair[0]].camera, run.images[pair[1]].camera
 
         def verified(matches: Matches) -> TwoViewGeometry | Rejected:
-            rng = np.random.default_rng([seed, *pair])
-            return verify_pair(points2D_1, points2D_2, matches, camera1, camera2, config, rng=rng)
+            points, known, rng = (points2D_1, points2D_2), (camera1, camera2), np.random.default_rng([seed, *pair])
+            return verify_pair(*points, matches, *known, config, distinct1=distinct1, distinct2=distinct2, rng=rng)
 
         geometry = verified(matches)
         if guided and isinstance(geometry, TwoViewGeometry) and geometry.kind in _GUIDING:

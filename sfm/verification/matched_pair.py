@@ -75,6 +75,10 @@ class MatchedPair:
         first, second = self._ideal_points()
         return float(np.nanmedian(transfer_errors(homography, first[inliers], second[inliers])))
 
+    def transferred(self, homography: Matrix3) -> Mask:
+        """The matches that a homography explains."""
+        return transfer_errors(homography, *self._ideal_points()) <= self.ransac.max_error_px
+
     def tri_angle(self, pose: Rigid3, inliers: Mask) -> float:
         """Median angle in radians at which the rays of the inliers meet."""
         turned = pose.rotation @ self.bearings1.rays[inliers]

@@ -30,7 +30,9 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def plausible_geometry(points2D_1, points2D_2, matches, camera1, camera2, config, *, rng):
+def plausible_geometry(
+    points2D_1, points2D_2, matches, camera1, camera2, config, *, rng, distinct1=None, distinct2=None
+):
     """Takes the matches that agree with the median shift; in fact the truth for cuts of one picture."""
     if len(matches) < 15:
         return Rejected("too_few_matches", f"{len(matches)} of 15")

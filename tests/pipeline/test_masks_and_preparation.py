@@ -125,8 +125,8 @@ def test_a_network_without_its_file_is_a_mistake_in_words(photos, tmp_path):
 def test_guided_matching_adds_what_agrees_with_a_verified_pair(photos, tmp_path, monkeypatch):
     plausible = stages.verify_pair
 
-    def along_rows(*inputs, rng):
-        geometry = plausible(*inputs, rng=rng)
+    def along_rows(*inputs, rng, **distinct):
+        geometry = plausible(*inputs, rng=rng, **distinct)
         shift = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # the photos are cuts side by side
         return dataclasses.replace(geometry, F=shift) if geometry else geometry
 
