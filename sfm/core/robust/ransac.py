@@ -58,7 +58,7 @@ class RansacConfig:
     score: Literal["truncated", "marginalized"] = "marginalized"
     """By which models are compared: Σ min(r², ε²) for the largest error ε of an inlier, or the mean of the like over
     all bounds from 0 up to four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge of the
-    noise: with bounds of 1 px, less than the noise of many photos, it misses fewer models than any peer."""
+    noise: a bound of 1 px, less than the noise of many photos, then costs no models."""
     confidence: float = 0.9999
     """Probability with which an all-inlier sample has been drawn when sampling ends."""
     trials_factor: float = 1.0
@@ -180,7 +180,9 @@ def required_iterations(inliers: int, count: int, sample_size: int, config: Rans
 def ransac(
     problem: CompiledProblem, config: RansacConfig, rng: np.random.Generator, quality: Vector | None = None
 ) -> Estimate | Rejected:
-    """The model that most data agree with; see the module. `config.max_error_px` is not used: the problem has it.
+    """The model that most data agree with; see the module.
+
+    The largest error of an inlier is the problem's; `config.max_error_px` tells only what a pixel is beside it.
 
     Args:
         quality: (N,) larger for data that are more likely right; samples are then drawn from the best ones first.
