@@ -90,7 +90,7 @@ def _off_plane(
     Reference:
         Chum, Werner & Matas, Two-view geometry estimation unaffected by a dominant plane, CVPR 2005.
     """
-    wide, loss = problem.within(problem.max_error * farthest_bound(config)), loss_of(config)
+    wide, loss = problem.within(problem.max_error * farthest_bound(problem.solver, config)), loss_of(config)
     near = wide.squared_errors(estimate.model) < wide.max_error**2
     plane = _dominant_plane(columns[:, near], wide.max_error, rng)
     if plane is None:

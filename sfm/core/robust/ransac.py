@@ -41,10 +41,10 @@ from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._two_view_kernels import TwoViews
 from sfm.core.robust.sampling import Sampler
 
-_SCALE = 1.5
+_SCALE = 2.0
 # Local optimisation looks at no more data than these, since all of them wait for the end.
 LOCAL_DATA = 500
-_REACH, _FARTHEST_PX = 4.0, 8.0
+_FARTHEST_PX = 8.0
 LOCAL_TOLERANCE, _FINAL_TOLERANCE = 1e-2, 1e-5
 
 
@@ -57,7 +57,7 @@ class RansacConfig:
     images. The final refinement adapts to the noise, so that the accuracy depends little on it."""
     score: Literal["truncated", "marginalized"] = "marginalized"
     """By which models are compared: Σ min(r², ε²) for the largest error ε of an inlier, or the mean of the like over
-    all bounds from 0 up to four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge of the
+    all bounds from 0 up to three or four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge of the
     noise: a bound of 1 px, less than the noise of many photos, then costs no models."""
     confidence: float = 0.9999
     """Probability with which an all-inlier sample has been drawn when sampling ends."""
@@ -92,6 +92,8 @@ class Solver(NamedTuple):
     """Rounds of sampling among the inliers of the best model, for models whose refinement has many local minima."""
     effort: float = 1.0
     """Share of the smallest number of samples that is needed: less for small samples, whose models are more stable."""
+    reach: float = 4.0
+    """Up to which multiple of the largest error of an inlier the marginalised score takes its bounds."""
 
     def moderated(self, config: RansacConfig) -> RansacConfig:
         """The configuration with the smallest number of samples that this solver needs."""
@@ -191,7 +193,10 @@ def ransac(
     if problem.count < needed:
         return Rejected("too_few_points", f"{problem.count} of {needed} needed")
     config, loss = problem.solver.moderated(config), loss_of(config)
-    wide, shuffled = problem.within(problem.max_error * farthest_bound(config)), rng.permutation(problem.count)
+    wide, shuffled = (
+        problem.within(problem.max_error * farthest_bound(problem.solver, config)),
+        rng.permutation(problem.count),
+    )
     searched, ordered = wide.ordered(shuffled), None if quality is None else quality[shuffled]
     sampler = Sampler(problem.count, problem.sample_size, config.max_iterations, rng, ordered)
     model, bounds = np.zeros(SIZE), np.full(2, problem.count * wide.max_error**2)
@@ -235,11 +240,11 @@ def loss_of(config: RansacConfig) -> np.int64:
     return MARGINALIZED if config.score == "marginalized" else TRUNCATED
 
 
-def farthest_bound(config: RansacConfig) -> float:
+def farthest_bound(solver: Solver, config: RansacConfig) -> float:
     """The largest error bound over which scores are taken, as a multiple of the largest error of an inlier."""
     if config.score == "truncated":
         return 1.0
-    return max(min(_REACH, _FARTHEST_PX / config.max_error_px), 1.0)
+    return max(min(solver.reach, _FARTHEST_PX / config.max_error_px), 1.0)
 
 
 def _progressive_limit(inliers: Mask, sample_size: int, config: RansacConfig) -> tuple[int, int]:
@@ -275,7 +280,7 @@ def polish(problem: CompiledProblem, model: FloatArray) -> tuple[FloatArray, Vec
     inliers = squares[squares < problem.max_error**2]
     if not len(inliers):
         return model, squares
-    # 1.5 medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat from 1 to 2 medians; at
+    # Two medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat from 1.5 to 2 medians; at
     # 3.5, which is 95 % efficient on Gaussian noise, it is lower: the noise of keypoints has tails.
     median = np.partition(inliers, len(inliers) // 2)[len(inliers) // 2]
     scale = max(_SCALE * math.sqrt(float(median)), 1e-3 * problem.max_error)

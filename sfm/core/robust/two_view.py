@@ -18,7 +18,9 @@ def essential_matrix(
     data = np.empty((18, len(rays1)))
     data[:3], data[3:6] = rays1.T, rays2.T
     data[6:12], data[12:] = jacobians1.reshape(-1, 6).T, jacobians2.reshape(-1, 6).T
-    return CompiledProblem(kernels.TwoViews(kernels.ESSENTIAL, data), Solver(five_point, 5, 10), max_error_px)
+    return CompiledProblem(
+        kernels.TwoViews(kernels.ESSENTIAL, data), Solver(five_point, 5, 10, restarts=4, reach=3.0), max_error_px
+    )
 
 
 def fundamental_matrix(columns: FloatArray, max_error: float) -> CompiledProblem:

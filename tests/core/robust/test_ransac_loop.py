@@ -18,7 +18,7 @@ from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 from sfm.core.robust._two_view_kernels import ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY, moved, plausible, start
 from sfm.core.robust._two_view_kernels import equations as two_view_equations
 from sfm.core.robust.absolute_pose import ReprojectionProblem, resection
-from sfm.core.robust.ransac import RansacConfig, farthest_bound, ransac, required_iterations
+from sfm.core.robust.ransac import RansacConfig, Solver, farthest_bound, ransac, required_iterations
 from sfm.core.robust.refinement import refine
 from sfm.core.robust.relative_pose import flat
 from sfm.core.robust.sampling import Sampler
@@ -216,9 +216,13 @@ def test_samples_are_the_same_however_many_are_taken_at_a_time(quality):
 
 
 def test_scores_reach_over_bounds_of_the_noise_up_to_eight_pixels():
-    reached = {px: farthest_bound(RansacConfig(max_error_px=px)) * px for px in (0.5, 1.0, 2.0, 4.0, 12.0)}
-    assert reached == {0.5: 2.0, 1.0: 4.0, 2.0: 8.0, 4.0: 8.0, 12.0: 12.0}
-    assert farthest_bound(RansacConfig(max_error_px=1.0, score="truncated")) == 1.0
+    def reached(solver: Solver) -> list[float]:
+        return [px * farthest_bound(solver, RansacConfig(max_error_px=px)) for px in (0.5, 1.0, 2.0, 4.0, 12.0)]
+
+    solver = Solver(print, 7, 3)
+    assert reached(solver) == [2.0, 4.0, 8.0, 8.0, 12.0]
+    assert reached(solver._replace(reach=3.0)) == [1.5, 3.0, 6.0, 8.0, 12.0]
+    assert farthest_bound(solver, RansacConfig(max_error_px=1.0, score="truncated")) == 1.0
 
 
 def _rank_two(rng):
