@@ -32,16 +32,22 @@ import numpy as np
 
 from sfm.core.arrays import FloatArray, Mask, Vector
 from sfm.core.errors import ConfigError, Rejected
+from sfm.core.robust import _loop_kernels as kernels
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._focal_resection_kernels import FocalResection
 from sfm.core.robust._focal_views_kernels import FocalViews
-from sfm.core.robust._loop_kernels import best_model, improve, search
-from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED
+from sfm.core.robust._loss_kernels import MARGINALIZED, TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._two_view_kernels import TwoViews
 from sfm.core.robust.sampling import Sampler
 
-_SCALE = 2.0
+_MEDIANS = 2.0
+"""Scale of the final refinement, in medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat
+from 1.5 to 2; at 3.5, which is 95 % efficient on Gaussian noise, it is lower: the noise of keypoints has tails."""
+_RESTART = 20
+"""Samples of one search among the inliers."""
+AT_ONCE = kernels.Stopping(0, 0, 0.5, 1.0, 0, 0, True)
+"""Ends a search with the first better model."""
 # Local optimisation looks at no more data than these, since all of them wait for the end.
 LOCAL_DATA = 500
 _FARTHEST_PX = 8.0
@@ -57,8 +63,8 @@ class RansacConfig:
     images. The final refinement adapts to the noise, so that the accuracy depends little on it."""
     score: Literal["truncated", "marginalized"] = "marginalized"
     """By which models are compared: Σ min(r², ε²) for the largest error ε of an inlier, or the mean of the like over
-    all bounds from 0 up to three or four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge of the
-    noise: a bound of 1 px, less than the noise of many photos, then costs no models."""
+    all bounds from 0 up to three or four times ε (to 8 px at most, unless ε is larger). The mean asks for no knowledge
+    of the noise: a bound of 1 px, less than the noise of many photos, then costs no models."""
     confidence: float = 0.9999
     """Probability with which an all-inlier sample has been drawn when sampling ends."""
     trials_factor: float = 1.0
@@ -121,15 +127,53 @@ class CompiledProblem:
         """The problem with another largest error of an inlier."""
         return CompiledProblem(self.data, self.solver, max_error)
 
-    def search(self, samples: np.ndarray, loss: np.int64, bounds: FloatArray, best: FloatArray) -> tuple[int, int]:
+    def search(
+        self,
+        samples: np.ndarray,
+        loss: np.int64,
+        bounds: FloatArray,
+        best: FloatArray,
+        *,
+        drawn: int = 0,
+        stopping: kernels.Stopping = AT_ONCE,
+    ) -> tuple[int, int]:
         """Looks for a better model among those of minimal samples, rows of indices; see `_loop_kernels`.
 
         Data must be in random order: models are given up for the first of them, and refined on the first of them.
         """
+        models = np.zeros((self.solver.max_solutions, SIZE))
+        return kernels.search(
+            self.data,
+            self.some,
+            samples,
+            models,
+            loss,
+            self.max_error**2,
+            LOCAL_TOLERANCE,
+            drawn,
+            stopping,
+            bounds,
+            best,
+        )
+
+    def search_inliers(
+        self, generator: np.ndarray, inlier_error: float, loss: np.int64, bounds: FloatArray, best: FloatArray
+    ) -> None:
+        """Replaces the model by a better one among those of samples of its inliers, if there is one."""
+        if not self.solver.restarts:
+            return
+        samples, models = np.empty((_RESTART, self.sample_size), np.int64), np.zeros((self.solver.max_solutions, SIZE))
+        kernels.search_inliers(
+            self.data, self.some, generator, self.solver.restarts, samples, models, loss, self.max_error**2,
+            inlier_error**2, LOCAL_TOLERANCE, bounds, best,
+        )  # fmt: skip
+
+    @property
+    def some(self) -> TwoViews | Resection | FocalViews | FocalResection:
+        """The data that local optimisation looks at."""
         if self._some is None:
             self._some = self.data._replace(data=np.ascontiguousarray(self.data.data[:, :LOCAL_DATA]))
-        models = np.zeros((self.solver.max_solutions, SIZE))
-        return search(self.data, self._some, samples, models, loss, self.max_error**2, LOCAL_TOLERANCE, bounds, best)
+        return self._some
 
     def proposals(self, samples: np.ndarray) -> FloatArray:
         """Models of minimal samples, rows of indices."""
@@ -138,12 +182,12 @@ class CompiledProblem:
 
     def best(self, models: FloatArray, loss: np.int64, bound: float) -> tuple[int, float, int]:
         """Index of the model with the lowest score below `bound` or −1, its score and its number of inliers."""
-        return best_model(self.data, models, loss, self.max_error**2, bound, np.empty(self.count))
+        return kernels.best_model(self.data, models, loss, self.max_error**2, bound, np.empty(self.count))
 
     def squared_errors(self, model: FloatArray) -> Vector:
         """r² of every datum; infinite or NaN where there is none."""
         squares = np.empty(self.count)
-        best_model(self.data, model[None], TRUNCATED, self.max_error**2, np.inf, squares)
+        kernels.best_model(self.data, model[None], TRUNCATED, self.max_error**2, np.inf, squares)
         return squares
 
     def improved(self, model: FloatArray, loss: np.int64, scale: float, tolerance: float) -> FloatArray:
@@ -152,7 +196,7 @@ class CompiledProblem:
         A degenerate model, which has no tangent space, is returned as it is.
         """
         model = model.copy()
-        improve(self.data, model, loss, scale**2, self.max_error**2, tolerance)
+        kernels.improve(self.data, model, loss, scale**2, self.max_error**2, tolerance)
         return model
 
 
@@ -168,15 +212,8 @@ class Estimate:
 
 def required_iterations(inliers: int, count: int, sample_size: int, config: RansacConfig) -> int:
     """Samples needed to draw one of inliers only with the configured confidence, within the configured limits."""
-    if count < sample_size:
-        return config.max_iterations
-    clean = math.prod(max(inliers - i, 0) / (count - i) for i in range(sample_size))
-    if clean >= 1 - 1e-12:
-        return config.min_iterations
-    if clean <= 1e-12:
-        return config.max_iterations
-    needed = config.trials_factor * math.log(1 - config.confidence) / math.log1p(-clean)
-    return int(min(max(math.ceil(needed), config.min_iterations), config.max_iterations))
+    limits = config.confidence, config.trials_factor, config.min_iterations, config.max_iterations
+    return kernels.required_samples(inliers, count, sample_size, *limits)
 
 
 def ransac(
@@ -203,8 +240,10 @@ def ransac(
     # As long as no model has enough inliers, sampling ends when one would have been found.
     hopeful = dataclasses.replace(config, trials_factor=1.0)
     limit = hopeless = required_iterations(needed, problem.count, problem.sample_size, hopeful)
+    stopping = _stopping(config, needed, hopeless, at_once=sampler.order is not None)
     while sampler.used < limit:
-        used, inliers = searched.search(sampler.ahead(limit - sampler.used), loss, bounds, model)
+        samples = sampler.ahead(limit - sampler.used)
+        used, inliers = searched.search(samples, loss, bounds, model, drawn=sampler.used, stopping=stopping)
         sampler.use(used)
         if inliers < needed:
             limit = limit if inliers < 0 else hopeless
@@ -215,24 +254,16 @@ def ransac(
             limit, sampler.reach = _progressive_limit(near, problem.sample_size, config)
     if not model.any():
         return Rejected("no_model", f"none of {sampler.used} samples gave one")
-    _search_inliers(searched, sampler, loss, bounds, model)
+    searched.search_inliers(sampler.generator, problem.max_error, loss, bounds, model)
     model, squares = polish(wide, model)
     mask = squares < problem.max_error**2
     rejected = judged(mask, needed, config)
     return Estimate(model, float(bounds[1]), mask, sampler.used) if rejected is None else rejected
 
 
-def _search_inliers(
-    problem: CompiledProblem, sampler: Sampler, loss: np.int64, bounds: FloatArray, model: FloatArray
-) -> None:
-    """Replaces the model by a better one among those of samples of its inliers, if there is one.
-
-    Refinement of F ends in one of many local minima; the models of clean samples lie near most of them.
-    """
-    inliers = np.flatnonzero(problem.squared_errors(model) < problem.max_error**2)
-    for _ in range(problem.solver.restarts if len(inliers) > problem.sample_size else 0):
-        bounds[0] = problem.count * problem.max_error**2
-        problem.search(sampler.among(inliers), loss, bounds, model)
+def _stopping(config: RansacConfig, needed: int, hopeless: int, *, at_once: bool) -> kernels.Stopping:
+    bounds = config.min_iterations, config.max_iterations
+    return kernels.Stopping(needed, hopeless, config.confidence, config.trials_factor, *bounds, at_once)
 
 
 def loss_of(config: RansacConfig) -> np.int64:
@@ -276,13 +307,6 @@ def judged(inliers: Mask, needed: int, config: RansacConfig) -> Rejected | None:
 
 def polish(problem: CompiledProblem, model: FloatArray) -> tuple[FloatArray, Vector]:
     """Final refinement with Cauchy's loss, cut off at the error bound, at a scale taken from the inliers; and r²."""
-    squares = problem.squared_errors(model)
-    inliers = squares[squares < problem.max_error**2]
-    if not len(inliers):
-        return model, squares
-    # Two medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat from 1.5 to 2 medians; at
-    # 3.5, which is 95 % efficient on Gaussian noise, it is lower: the noise of keypoints has tails.
-    median = np.partition(inliers, len(inliers) // 2)[len(inliers) // 2]
-    scale = max(_SCALE * math.sqrt(float(median)), 1e-3 * problem.max_error)
-    model = problem.improved(model, CAUCHY, scale, _FINAL_TOLERANCE)
-    return model, problem.squared_errors(model)
+    model, squares = model.copy(), np.empty(problem.count)
+    kernels.polish(problem.data, model, _MEDIANS, problem.max_error**2, _FINAL_TOLERANCE, squares)
+    return model, squares

@@ -12,7 +12,7 @@ from sfm.core.robust._damping_kernels import damped_step
 from sfm.core.robust._loss_kernels import CAUCHY
 
 _FINAL_STEPS = 20
-_SCALE = 1.5
+_SCALE = 2.0
 
 
 @runtime_checkable

@@ -7,7 +7,7 @@ import numpy as np
 from sfm.core.arrays import Vector
 from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 
-BATCH = 20
+BATCH = 50
 """Samples drawn at once, at first. Later as many as have been used, so that kernels are called a few times only."""
 
 
@@ -23,7 +23,7 @@ class Sampler:
         """For samples of `size` among `count` data; progressive samples are spread over `horizon` draws."""
         self.order = None if quality is None else np.argsort(-quality, kind="stable")
         self.count, self.horizon, self.reach, self.used = count, float(horizon), count, 0
-        self._generator, self._growth = rng.integers(1, 2**32, 1), np.zeros(3)
+        self.generator, self._growth = rng.integers(1, 2**32, 1), np.zeros(3)
         self._ahead = np.empty((0, size), np.int64)
 
     def ahead(self, most: int) -> np.ndarray:
@@ -31,9 +31,9 @@ class Sampler:
         if not len(self._ahead):
             self._ahead = np.empty((max(BATCH, self.used), self._ahead.shape[1]), np.int64)
             if self.order is None:
-                draw_samples(self._generator, self.count, self._ahead)
+                draw_samples(self.generator, self.count, self._ahead)
             else:
-                reach = (self._generator, self.used, self.reach, self.count, self.horizon, self._growth)
+                reach = (self.generator, self.used, self.reach, self.count, self.horizon, self._growth)
                 draw_progressively(*reach, self._ahead)
                 self._ahead = self.order[self._ahead]
         return self._ahead[:most]
@@ -41,9 +41,3 @@ class Sampler:
     def use(self, number: int) -> None:
         """Takes as many of the samples ahead away."""
         self._ahead, self.used = self._ahead[number:], self.used + number
-
-    def among(self, chosen: np.ndarray) -> np.ndarray:
-        """A batch of uniform samples of the indices `chosen`, which may be few but not fewer than a sample has."""
-        samples = np.empty((BATCH, self._ahead.shape[1]), np.int64)
-        draw_samples(self._generator, len(chosen), samples)
-        return chosen[samples]
