@@ -4,8 +4,8 @@
 
 Both sides start from an empty database, ours through the stages of `sfm run`, pycolmap at its defaults (exhaustive
 matching); with `--max-image-size` both reduce larger images to that size. A round runs one side after the other;
-medians count. Then pycolmap's incremental mapper makes models of both databases, with the true cameras where they
-are known, so that registered images and pose errors compare the front ends alone.
+medians count. Then pycolmap's incremental mapper makes models of both databases, and so does ours, with the true
+cameras where they are known, so that registered images and pose errors compare the front ends alone.
 
 Robust estimators have a benchmark of their own (bench_robust), and so has the choice of pairs (bench_pairs).
 """
@@ -29,12 +29,15 @@ import pycolmap
 from scripts.bench_sfm import SETS, environment, image_names, score, set_cameras
 from sfm.core.events import SILENT, Event, Observer, StageFinished, StageStarted
 from sfm.core.scene import Reconstruction
+from sfm.io.colmap_model import write_model
 from sfm.io.database import Database
+from sfm.mapping import map_incrementally
 from sfm.pipeline.config import DEFAULTS, with_settings
 from sfm.pipeline.pairs import match_and_verify
 from sfm.pipeline.scene import read_scene
 from sfm.pipeline.stages import Run, extract_all
 from sfm.pipeline.warm_up import run_parts
+from sfm.viewgraph import calibrate_focal_lengths, cycle_consistency, poses_under, without_contradictions
 
 STAGE_SETS = ("fountain-P11", "Herz-Jesus-P8", "SceauxCastle", "lund", "middlebury_templeRing")
 
@@ -46,7 +49,7 @@ def main() -> int:
         os.execv(sys.executable, [sys.executable, "-m", "scripts.bench_frontend", *sys.argv[1:]])
     cv2.setNumThreads(1)
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR.value)
-    run_parts(["pair", "features"])
+    run_parts(["pair", "models", "features"])
     rows = list(results(options))
     if options.json:
         report = {"environment": environment(options.threads), "results": rows}
@@ -90,6 +93,7 @@ def results(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                 row[side] = {"seconds": seconds, "total_s": sum(seconds.values())}
                 if not options.no_mapping:
                     row[side]["model"] = mapped(images, Path(folder) / side, truth, options)
+                    row[side]["our model"] = mapped_by_us(images, Path(folder) / side, truth, options)
                 print(f"{name:22} {side:9} {told(row[side])}", flush=True)
         if not options.only_ours:
             row["ratio"] = row["ours"]["total_s"] / row["pycolmap"]["total_s"]
@@ -100,10 +104,11 @@ def results(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 def told(side: dict[str, Any]) -> str:
     parts = " ".join(f"{stage} {value:.2f}" for stage, value in side["seconds"].items())
     text = f"{side['total_s']:6.2f} s ({parts})"
-    if "model" in side:
-        auc, model = auc_at_1(side["model"]), side["model"]
-        text += f"   {model['registered']}/{model['images']} registered {model['models']}"
-        text += f", AUC@1° {auc:.1f}" if auc is not None else ""
+    for key, mapper in (("model", "pycolmap's mapper"), ("our model", "ours")):
+        if key in side:
+            auc, model = auc_at_1(side[key]), side[key]
+            text += f"   {mapper}: {model['registered']}/{model['images']} {model['models']}"
+            text += f" AUC@1° {auc:.1f}" if auc is not None else ""
     return text
 
 
@@ -177,6 +182,38 @@ def mapped(images: Path, folder: Path, truth: Reconstruction | None, options: ar
     (folder / "sparse").mkdir()
     pycolmap.incremental_mapping(database, images, folder / "sparse", mapping)
     return score(folder / "sparse", image_names(images), truth)
+
+
+def mapped_by_us(
+    images: Path, folder: Path, truth: Reconstruction | None, options: argparse.Namespace
+) -> dict[str, Any]:
+    """What our mapper makes of the same database."""
+    with Database.open(folder / "database0.db") as db:
+        keypoints = {row.image_id: db.read_keypoints(row.image_id) for row in db.images()}
+        scales = {image_id: db.read_keypoint_scales(image_id) for image_id in keypoints}
+        image_cameras = {row.image_id: row.camera_id for row in db.images()}
+        names = {row.image_id: row.name for row in db.images()}
+        graph, cameras = db.read_view_graph(), db.cameras()
+    if truth is None:
+        cameras = calibrate_focal_lengths(graph, cameras, image_cameras, doubt_known=True)
+    graph = poses_under(graph, keypoints, cameras, image_cameras)
+    graph = without_contradictions(graph, cycle_consistency(graph, DEFAULTS.cycles))
+    models = map_incrementally(
+        graph,
+        keypoints,
+        cameras,
+        image_cameras,
+        names,
+        DEFAULTS.mapping,
+        keypoint_scales=scales,
+        seed=0,
+        threads=options.threads,
+        refine_intrinsics=truth is None,
+        observer=SILENT,
+    )
+    for k, model in enumerate(models):
+        write_model(model, folder / "ours" / str(k))
+    return score(folder / "ours", image_names(images), truth)
 
 
 if __name__ == "__main__":
