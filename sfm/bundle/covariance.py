@@ -84,7 +84,7 @@ def covariance(
     Takes some 32 N² bytes for N free pose and camera parameters.
 
     Returns:
-        `undetermined`, with the image or camera that the observations leave open.
+        `undetermined_pose` or `undetermined_camera`, with the row of what the observations leave open as detail.
     """
     system, _ = system_of(problem, config, threads)
     layout, (cost, _) = system.layout, system.linearize()
@@ -92,7 +92,7 @@ def covariance(
     motions = _motions(problem, layout)[: len(S)] if config.gauge == "free" else np.zeros((len(S), 0))
     sigma = _inverse(S, ~system.held, motions)
     if isinstance(sigma, int):
-        return Rejected("undetermined", _named(sigma, layout))
+        return _undetermined(sigma, layout)
     points = np.zeros((len(problem.points3D), 3, 3))
     kernels.point_covariances(
         problem.free_points, layout.offsets, layout.starts, layout.obs_slot, layout.coupling_offsets,
@@ -178,9 +178,9 @@ def _camera_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) ->
     return blocks
 
 
-def _named(entry: int, layout: Layout) -> str:
+def _undetermined(entry: int, layout: Layout) -> Rejected:
     """Whose parameter an entry of the reduced system is."""
     poses = 6 * len(layout.slot_image)
     if entry < poses:
-        return f"the pose of image row {layout.slot_image[entry // 6]}"
-    return f"camera row {layout.slot_camera[(entry - poses) // layout.columns.shape[1]]}"
+        return Rejected("undetermined_pose", str(layout.slot_image[entry // 6]))
+    return Rejected("undetermined_camera", str(layout.slot_camera[(entry - poses) // layout.columns.shape[1]]))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sfm.cli.parsing import Flag, Model, parsed
-from sfm.core.errors import ConfigError, ExitCode, InputError, Rejected
+from sfm.core.errors import ConfigError, ExitCode, InputError
 
 if TYPE_CHECKING:
     from sfm.bundle.reconstruction import Intrinsics
@@ -157,8 +157,8 @@ def summary(refined: RefinedModel, folder: Path) -> str:
         lines.append(f"{result.invalid} observations have no projection (behind the camera) and took no part")
     if result.lost:
         lines.append(f"{result.lost} observations lost their projection on the way")
-    if isinstance(refined.covariance, Rejected):
-        lines.append(f"no standard deviations: the observations leave open {refined.covariance.detail}")
+    if refined.undetermined:
+        lines.append(f"no standard deviations: the observations leave open {refined.undetermined}")
     for camera_id, camera in list(model.cameras.items())[:5]:
         sigmas = refined.sigmas(camera_id)
         told = [

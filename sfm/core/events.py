@@ -91,6 +91,7 @@ class ImageRegistered(Event):
     registered: int
     points: int
     inliers: int = 0
+    needed: int = 0
     visible: int = 0
     reason: str = ""
 

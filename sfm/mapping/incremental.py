@@ -300,7 +300,7 @@ class _Mapper:
                     state.become(before)
                     state.unregister(image)
                     outcome = doubt
-            self.tell(state, image, outcome)
+            self.tell(state, image, outcome, config.leftover_min_inliers)
             if isinstance(outcome, Resection):
                 return True
             refused_at[image] = visible
@@ -324,13 +324,16 @@ class _Mapper:
         states, first = list(states), 0
         while first < len(states):
             for second in range(first + 1, len(states)):
-                if (both := self.join(states[first], states[second])) is not None:
+                both = self.join(states[first], states[second])
+                if both is None:
+                    continue
+                others = np.zeros(len(both.registered), bool)
+                for k, state in enumerate(states):
+                    others |= state.registered & (k not in (first, second))
+                self.grow_model(both, others)
+                if both.registered.sum() >= 2:  # else it fell apart, and two models are better than none
                     states[first] = both
                     del states[second]
-                    others = np.zeros(len(both.registered), bool)
-                    for state in states:
-                        others |= state.registered
-                    self.grow_model(both, others & ~both.registered)
                     break
             else:
                 first += 1
@@ -471,8 +474,8 @@ class _Mapper:
                 free[row, list(camera.model_info.principal_point_indices)] = True
         return free
 
-    def tell(self, state: State, image: int, outcome: Resection | Rejected) -> None:
-        """Tells the observer how a registration went."""
+    def tell(self, state: State, image: int, outcome: Resection | Rejected, needed: int | None = None) -> None:
+        """Tells the observer how a registration went that needed so many inliers."""
         ok = isinstance(outcome, Resection)
         self.observer(
             ImageRegistered(
@@ -480,6 +483,7 @@ class _Mapper:
                 registered=int(state.registered.sum()),
                 points=int(state.has_point.sum()),
                 inliers=outcome.inliers if ok else 0,
+                needed=self.config.resection_min_inliers if needed is None else needed,
                 visible=outcome.visible if ok else 0,
                 reason="" if ok else f"{outcome.reason}: {outcome.detail}",
             )

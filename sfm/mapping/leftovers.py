@@ -66,7 +66,7 @@ def chance_doubt(state: State, image: int, max_error_px: float) -> Rejected | No
     alarms = log10_false_alarms(agreeing, len(cells), min(chance, 1.0))
     if alarms <= _MAX_LOG10_FALSE_ALARMS:
         return None
-    return Rejected("maybe_chance", f"points agree in {agreeing} of {len(cells)} parts of the image only")
+    return Rejected("maybe_by_chance", f"points agree in {agreeing} of {len(cells)} parts of the image only")
 
 
 def match_doubt(state: State, first: Mask, second: Mask, view_graph: ViewGraph, max_error_px: float) -> Rejected | None:
@@ -93,4 +93,4 @@ def loss_doubt(state: State, image: int, min_observations: int) -> Rejected | No
     held = int(state.on[seen].sum())
     if held >= max(min_observations, _MIN_AGREEING_POINTS * len(seen)):
         return None
-    return Rejected("lost_observations", f"{held} of {len(seen)} points that two others see still fit")
+    return Rejected("few_points_hold", f"{held} of {len(seen)} points that two others see still fit")

@@ -67,7 +67,7 @@ def resect(
         scene.xy[rows],
         state.points[scene.track_of[rows]],
         camera,
-        RansacConfig(max_error_px=max_error_px),
+        RansacConfig(max_error_px=max_error_px, min_inliers=min(min_inliers, RansacConfig.min_inliers)),
         rng=rng,
         refine_focal=refine_focal,
     )

@@ -49,11 +49,9 @@ def _map(run: Run) -> list[Reconstruction]:
 
     def note(event: Event, /) -> None:
         if isinstance(event, ImageRegistered):
-            verdict, mapping = event.reason or "registered", config.mapping
-            last = verdict == "registered" and event.inliers < mapping.resection_min_inliers
-            threshold = float(mapping.leftover_min_inliers if last else mapping.resection_min_inliers)
+            verdict, numbers = event.reason or "registered", (float(event.inliers), float(event.needed))
             detail = f"{event.visible} points visible, {event.registered} images before"
-            decisions.append(Decision(STAGE, event.name, "inliers", float(event.inliers), threshold, verdict, detail))
+            decisions.append(Decision(STAGE, event.name, "inliers", *numbers, verdict, detail))
         run.observer(event)
 
     graph = database.read_view_graph()

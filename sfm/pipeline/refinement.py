@@ -20,6 +20,7 @@ from sfm.bundle.reconstruction import Intrinsics
 from sfm.core.errors import InputError, Rejected
 from sfm.core.events import SILENT, Observer
 from sfm.core.scene import Reconstruction
+from sfm.pipeline.memory import free_memory_bytes
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +48,9 @@ class RefinedModel:
     def to_json(self) -> dict[str, Any]:
         """Costs, iterations, and the cameras with their standard deviations."""
         result, table = self.result, [dataclasses.asdict(row) for row in self.result.table]
+        missing = {"undetermined": self.undetermined} if self.undetermined else {}
         return {
+            **missing,
             "initial_cost": result.initial_cost,
             "final_cost": result.final_cost,
             "reason": result.reason,
@@ -56,6 +59,16 @@ class RefinedModel:
             "cameras": {str(k): self.camera_json(k) for k in self.reconstruction.cameras},
             "iterations": table,
         }
+
+    @property
+    def undetermined(self) -> str:
+        """What the observations leave open, so that there are no standard deviations; else empty."""
+        if not isinstance(self.covariance, Rejected):
+            return ""
+        row, model = int(self.covariance.detail), self.reconstruction
+        if self.covariance.reason == "undetermined_pose":
+            return f"the pose of {model.image_names[row]}"
+        return f"camera {list(model.cameras)[row]}"
 
     def camera_json(self, camera_id: int) -> dict[str, Any]:
         """The parameters of a camera by their names, and the standard deviations of those that were free."""
@@ -88,7 +101,8 @@ def refine_model(
     Covariances are for residuals with the variance that is left at the end.
 
     Raises:
-        InputError: it has no observation with a projection, or several cameras on a rig, which would come apart.
+        InputError: it has no observation with a projection, or several cameras on a rig, which would come apart, or
+            covariances do not fit into memory.
     """
     if reconstruction.rigs:
         raise InputError(
@@ -99,6 +113,8 @@ def refine_model(
     problem = dataclasses.replace(
         problem, free_poses=problem.free_poses & config.poses, free_points=problem.free_points & config.points
     )
+    if with_covariance:
+        _check_memory(6 * int(problem.free_poses.sum()) + int(problem.free_params.sum()))
     result = adjust(problem, config.bundle, threads=threads, observer=observer)
     if result.invalid == len(problem.obs_images):
         raise InputError("no observation of this model has a projection; there is nothing to adjust")
@@ -107,3 +123,12 @@ def refine_model(
         found = covariance(result.problem, config.bundle, threads=threads)
         found = found.scaled() if isinstance(found, BundleCovariance) else found
     return RefinedModel(update_reconstruction(reconstruction, result.problem), result, found)
+
+
+def _check_memory(parameters: int) -> None:
+    needed, free = 32 * parameters**2, free_memory_bytes()
+    if free is not None and needed > free:
+        raise InputError(
+            f"standard deviations take {needed / 1e9:.0f} GB of memory here, and {free / 1e9:.0f} GB are free",
+            remedy="leave out --sigmas",
+        )

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -108,11 +108,10 @@ def extract_all(run: Run) -> dict[int, str]:
 def _feature_keys(run: Run) -> dict[int, str]:
     """What the features of each image are computed from; for corners that are followed, also all frames before it."""
     config, code = run.config.features, code_digest("sfm.prepare", "sfm.features", "sfm.io", "sfm.core")
-    basis = key_of(code, cv2.__version__, config, run.config.prepare, model_digest(config))
     follows = config.kind == "klt"
-    if follows:
-        basis = key_of(basis, run.config.tracking)
-    keys, key = {}, basis
+    settings = (config.max_image_size, run.config.tracking) if follows else (config, model_digest(config))
+    basis = key = key_of(code, cv2.__version__, config.kind, *settings, run.config.prepare)
+    keys = {}
     for image_id in _in_order_of_names(run) if follows else run.images:
         image = run.images[image_id]
         key = key_of(key if follows else basis, image.digest, *([image.mask.digest] if image.mask else []))
@@ -195,17 +194,12 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     points2D = lru_cache(_CACHED_IMAGES)(run.database.read_keypoints)
     features = lru_cache(_CACHED_IMAGES)(run.database.read_features)
 
-    @cache
-    def distinct(image_id: int) -> np.ndarray | None:
-        camera = run.images[image_id].camera
-        return distinct_features(run.database.read_features(image_id), camera.width, camera.height)
+    distinct = _distinct_features(run, stale) if config.detect_repetition else {}
 
     def inputs() -> Iterator[_Matched]:
         for i, j in _tiled(stale):
             matches, described = run.database.read_matches(i, j), [features(i), features(j)] if guided else []
-            worth_it = config.detect_repetition and len(matches) >= config.ransac.min_inliers
-            masks = (distinct(i), distinct(j)) if worth_it else (None, None)
-            yield (i, j), points2D(i), points2D(j), matches, masks, described
+            yield (i, j), points2D(i), points2D(j), matches, (distinct.get(i), distinct.get(j)), described
 
     def compute(item: _Matched) -> tuple[Pair, int, TwoViewGeometry | Rejected]:
         pair, points2D_1, points2D_2, matches, (distinct1, distinct2), described = item
@@ -240,6 +234,20 @@ def verify_all(run: Run, match_keys: Mapping[Pair, str]) -> dict[Pair, str]:
     rejected = len(keys.keys() & run.database.rejected_pairs().keys())
     run.observer(StageFinished(stage=stage, summary=f"{len(keys) - rejected} of {len(keys)} pairs"))
     return keys
+
+
+def _distinct_features(run: Run, pairs: Iterable[Pair]) -> dict[int, np.ndarray]:
+    """Which features of the images that repeat themselves are distinct; of pairs that have enough matches."""
+    counts, enough = run.database.match_counts(), run.config.verification.ransac.min_inliers
+    ids = sorted({image_id for pair in pairs if counts.get(pair, 0) >= enough for image_id in pair})
+
+    def compute(item: tuple[int, Features]) -> tuple[int, np.ndarray | None]:
+        camera = run.images[item[0]].camera
+        return item[0], distinct_features(item[1], camera.width, camera.height)
+
+    read = ((image_id, run.database.read_features(image_id)) for image_id in ids)
+    found = ordered_map(compute, read, threads=run.threads)
+    return {image_id: mask for image_id, mask in found if mask is not None}
 
 
 def _threads_that_fit(run: Run, image_ids: Iterable[int]) -> int:

@@ -83,6 +83,8 @@ class VerificationConfig:
     room in front of them 111 or more, and all of them."""
 
     def __post_init__(self) -> None:
+        if self.min_distinct_lead < 0:
+            raise ConfigError(f"min_distinct_lead must not be negative, got {self.min_distinct_lead}")
         for name in ("min_calibrated_ratio", "max_homography_ratio", "min_rotation_ratio", "min_watermark_ratio"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name} must be in (0, 1], got {getattr(self, name)}")

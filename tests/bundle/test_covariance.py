@@ -190,7 +190,7 @@ def test_what_observations_leave_open_is_named(make_problem, rng):
     for config in (BundleConfig(), FREE):
         found = covariance(few, config)
         assert isinstance(found, Rejected)
-        assert (found.reason, found.detail) == ("undetermined", "the pose of image row 3")
+        assert (found.reason, found.detail) == ("undetermined_pose", "3")
 
 
 def test_a_point_on_one_ray_has_no_covariance_and_others_keep_theirs(make_problem, rng):

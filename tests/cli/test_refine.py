@@ -101,6 +101,7 @@ def test_an_image_with_two_points_gets_no_nan_and_no_sigma(disturbed, tmp_path):
     reconstruction.write(tmp_path / "few")
     refined = refine_model(read_model(tmp_path / "few"), with_covariance=True)
     assert isinstance(refined.covariance, Rejected)
+    assert refined.to_json()["undetermined"] == f"the pose of {image.name}"
     assert np.isfinite(refined.reconstruction.cams_from_world.translation).all()
     assert np.isfinite(refined.reconstruction.points3D).all()
 

@@ -78,7 +78,7 @@ def test_points_side_by_side_are_not_enough():
     scene.keep_matches(lambda i, j, points: np.isin(points, crowd) | (j != LAST))
     model, told = mapped(scene)
     assert LAST not in model.image_ids
-    assert told == ["maybe_chance"]
+    assert told == ["maybe_by_chance"]
 
 
 def test_a_pose_that_the_other_matches_contradict_is_undone():
@@ -137,7 +137,7 @@ def test_doubts_arise_one_by_one():
     state.on[mine[14:]] = False
     lost = loss_doubt(state, image, 15)
     assert lost is not None
-    assert lost.reason == "lost_observations"
+    assert lost.reason == "few_points_hold"
     state.on[mine] = False
     assert chance_doubt(state, image, 12.0) is not None
     state.t[image] += [0.5, 0.0, 0.3]

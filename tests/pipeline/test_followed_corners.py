@@ -116,3 +116,12 @@ def test_what_needs_descriptors_is_refused(frames, tmp_path):
             check_pair_settings(opened(database, frames, asked))
     with pytest.raises(ConfigError, match="guided"):
         PipelineConfig(features=FeatureConfig(kind="klt"), matching=MatchingConfig(guided=True))
+
+
+def test_settings_of_other_detectors_change_nothing(frames, tmp_path):
+    with Database.open(tmp_path / "d.db") as database:
+        keys = extract_all(opened(database, frames))
+        other = PipelineConfig(features=FeatureConfig(kind="klt", max_features=77, contrast_threshold=0.5))
+        assert extract_all(opened(database, frames, other)) == keys
+        smaller = PipelineConfig(features=FeatureConfig(kind="klt", max_image_size=200))
+        assert not set(extract_all(opened(database, frames, smaller)).values()) & set(keys.values())

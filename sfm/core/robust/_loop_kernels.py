@@ -65,11 +65,12 @@ def score(problem, model, loss, max_square, bound, patience, squares):
 
     Of data in random order, the first n of N have n / N of the sum to within a few times √n p (1 − p), in units of
     ρ(∞) and with p = sum / N. A model whose first data cost more than `patience` such deviations above the share of
-    `bound` is given up as well. `squares` are those of the data that were looked at.
+    `bound` is given up as well; p (1 − p) counts as a twentieth at least, since a bound that no model has set yet has
+    p = 1, and says nothing. `squares` are those of the data that were looked at.
     """
     count, total, inliers, last = squares.shape[0], 0.0, 0, 0
     share = bound / count
-    deviation = patience * np.sqrt(max(share * (max_square - share), 0.0))
+    deviation = patience * np.sqrt(max(share * (max_square - share), 0.05 * max_square**2))
     while last < count:
         first, last = last, min(last + _BLOCK, count)
         squared_errors(problem, model, first, last, squares)
@@ -117,7 +118,7 @@ def search(problem, some, samples, models, loss, max_square, tolerance, drawn, s
             if total < bounds[0]:
                 bounds[0], improved = total, True
                 candidate[:] = models[n]
-        if improved and ((k + 1) % _ROUND == 0 or k + 1 == samples.shape[0]):
+        if improved and ((k + 1) % _ROUND == 0 or k + 1 == samples.shape[0] or drawn + k + 1 >= limit):
             improved = False
             improve(some, candidate, loss, max_square, max_square, tolerance)
             total, inliers = score(problem, candidate, loss, max_square, bounds[1], _ALL, squares)

@@ -67,8 +67,8 @@ def draw_progressively(generator, drawn, reach, count, horizon, growth, samples)
             larger = growth[1] * (growth[0] + 1.0) / (growth[0] + 1.0 - m)
             growth[2] += np.ceil(larger - growth[1])
             growth[0], growth[1] = growth[0] + 1.0, larger
-        n = int(growth[0])
-        if drawn + k + 1 > growth[2] or n == m:
+        n = min(int(growth[0]), reach)
+        if drawn + k + 1 > growth[2] or n == m or n < growth[0]:
             draw(generator, n, m, samples[k])
         else:
             draw(generator, n - 1, m - 1, samples[k])

@@ -9,7 +9,6 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Mask, Points2D, Points3D, Value, Vector, readonly
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.geometry.minimal._p3p_kernels import p3p
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.robust._absolute_pose_kernels import Resection
@@ -53,7 +52,7 @@ def resection(
     _, by_point, _, projects = camera.project_with_jacobians(rays)
     usable = valid & projects & np.isfinite(points2D).all(1) & np.isfinite(points3D).all(1)
     data = np.concatenate([rays, by_point.reshape(-1, 6), points3D], axis=1)[usable]
-    return CompiledProblem(Resection(np.ascontiguousarray(data.T)), Solver(p3p, 3, 4, effort=0.5), max_error_px), usable
+    return CompiledProblem(Resection(np.ascontiguousarray(data.T)), Solver(3, 4, effort=0.5), max_error_px), usable
 
 
 class ReprojectionProblem:

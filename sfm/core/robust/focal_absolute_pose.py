@@ -7,7 +7,7 @@ import numpy as np
 from sfm.core.arrays import FloatArray, Mask, Points2D, Points3D, Vector
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
-from sfm.core.geometry.minimal._p4pf_kernels import MAX_SOLUTIONS, p4pf
+from sfm.core.geometry.minimal._p4pf_kernels import MAX_SOLUTIONS
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.robust._focal_resection_kernels import FocalResection, focal_of
@@ -30,8 +30,9 @@ def estimate_absolute_pose_with_focal(
     rng: np.random.Generator,
     quality: Vector | None = None,
 ) -> AbsolutePoseEstimate | Rejected:
-    """The pose and the focal length that most points agree with, by P4Pf and LO-RANSAC, whatever the guess.
+    """The pose and the focal length that most points agree with, by P4Pf and LO-RANSAC.
 
+    The guess may be off by a factor of 20.
     `estimate_absolute_pose` with `refine_focal` tries nine multiples of the guess instead, for cameras of any model. On
     made-up views both are as accurate; this takes a tenth of the time with 30 % of wrong points, and finds focal
     lengths that are farther from the guess. Its kernels are not among those that `sfm run` compiles ahead (6 s).
@@ -71,7 +72,7 @@ def focal_resection(
     usable = valid & np.isfinite(points3D).all(1)
     unit_px = camera.mean_focal_length
     data = np.ascontiguousarray(np.concatenate([pixels / unit_px, points3D], axis=1)[usable].T)
-    return CompiledProblem(FocalResection(data), Solver(p4pf, 4, MAX_SOLUTIONS), max_error_px / unit_px), usable
+    return CompiledProblem(FocalResection(data), Solver(4, MAX_SOLUTIONS), max_error_px / unit_px), usable
 
 
 def state_of(model: FloatArray) -> FloatArray:

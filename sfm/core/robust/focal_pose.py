@@ -13,8 +13,6 @@ from sfm.core.geometry.epipolar import pose_from_essential
 from sfm.core.geometry.minimal._six_point_kernels import (
     MAX_ONE_SIDED_SOLUTIONS,
     MAX_SHARED_SOLUTIONS,
-    six_point_one_sided_focal,
-    six_point_shared_focal,
 )
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.robust._focal_views_kernels import FocalViews
@@ -71,7 +69,7 @@ def estimate_relative_pose_shared_focal(
     """
     unit_px = 0.5 * float(np.hypot(camera.width, camera.height))
     first, second = _centered(points2D_1, camera) / unit_px, _centered(points2D_2, camera) / unit_px
-    solver = Solver(six_point_shared_focal, 6, MAX_SHARED_SOLUTIONS)
+    solver = Solver(6, MAX_SHARED_SOLUTIONS)
     return _estimated(first, second, camera, camera, True, unit_px, solver, config, rng, quality)
 
 
@@ -94,7 +92,7 @@ def estimate_relative_pose_one_focal(
     """
     unit_px = camera2.mean_focal_length
     first, second = _centered(points2D_1, camera1) / unit_px, _centered(points2D_2, camera2) / unit_px
-    solver = Solver(six_point_one_sided_focal, 6, MAX_ONE_SIDED_SOLUTIONS)
+    solver = Solver(6, MAX_ONE_SIDED_SOLUTIONS)
     return _estimated(first, second, camera1, camera2, False, unit_px, solver, config, rng, quality)
 
 

@@ -30,7 +30,7 @@ from sfm.core.robust.two_view import common_normalisation, fundamental_matrix, h
 _DOMINANT = 0.6
 """Share of the inliers of F that makes a plane dominant."""
 _OFF_PLANE = 2.0
-"""Pairs are off the plane beyond so many error bounds."""
+"""Pairs are off the plane beyond so many of the largest errors of an inlier."""
 _PLANE_SAMPLES, _PARALLAX_SAMPLES = 60, 150
 """Of 60 samples of four one is clean on a dominant plane with a probability of 0.9998."""
 _PLANE_DATA = 200
@@ -96,7 +96,7 @@ def _off_plane(
     if plane is None:
         return estimate
     squares = homography_matrix(columns, wide.max_error).squared_errors(plane)
-    off = rng.permutation(np.flatnonzero(squares > (_OFF_PLANE * wide.max_error) ** 2))
+    off = rng.permutation(np.flatnonzero(squares > (_OFF_PLANE * problem.max_error) ** 2))
     if len(off) < 2:
         return estimate
     off = columns[:, off[:_PLANE_DATA]]

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -37,7 +36,7 @@ from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._focal_resection_kernels import FocalResection
 from sfm.core.robust._focal_views_kernels import FocalViews
 from sfm.core.robust._loss_kernels import MARGINALIZED, TRUNCATED
-from sfm.core.robust._problem_kernels import SIZE
+from sfm.core.robust._problem_kernels import SIZE, solve
 from sfm.core.robust._two_view_kernels import TwoViews
 from sfm.core.robust.sampling import Sampler
 
@@ -89,9 +88,8 @@ class RansacConfig:
 
 
 class Solver(NamedTuple):
-    """A kernel that fills an array with the models of samples and returns how many they are."""
+    """What is to be known of a minimal solver; `_problem_kernels.solve` calls it."""
 
-    kernel: Callable[[FloatArray, np.ndarray, FloatArray], int]
     sample_size: int
     max_solutions: int
     restarts: int = 0
@@ -178,7 +176,7 @@ class CompiledProblem:
     def proposals(self, samples: np.ndarray) -> FloatArray:
         """Models of minimal samples, rows of indices."""
         models = np.zeros((self.solver.max_solutions * len(samples), SIZE))
-        return models[: self.solver.kernel(self.data.data, samples, models)]
+        return models[: solve(self.data, samples, models)]
 
     def best(self, models: FloatArray, loss: np.int64, bound: float) -> tuple[int, float, int]:
         """Index of the model with the lowest score below `bound` or −1, its score and its number of inliers."""
@@ -251,7 +249,8 @@ def ransac(
             limit = required_iterations(inliers, problem.count, problem.sample_size, config)
         else:
             near = searched.squared_errors(model)[sampler.order] < wide.max_error**2
-            limit, sampler.reach = _progressive_limit(near, problem.sample_size, config)
+            limit, reach = _progressive_limit(near, problem.sample_size, config)
+            sampler.restrict(reach)
     if not model.any():
         return Rejected("no_model", f"none of {sampler.used} samples gave one")
     searched.search_inliers(sampler.generator, problem.max_error, loss, bounds, model)

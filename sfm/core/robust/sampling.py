@@ -38,6 +38,11 @@ class Sampler:
                 self._ahead = self.order[self._ahead]
         return self._ahead[:most]
 
+    def restrict(self, reach: int) -> None:
+        """From now on, progressive samples are of the best `reach` data."""
+        if reach != self.reach:
+            self.reach, self._ahead = reach, self._ahead[:0]
+
     def use(self, number: int) -> None:
         """Takes as many of the samples ahead away."""
         self._ahead, self.used = self._ahead[number:], self.used + number

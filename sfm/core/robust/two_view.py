@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.core.arrays import FloatArray, Points2D, Rays
-from sfm.core.geometry.minimal._five_point_kernels import five_point
-from sfm.core.geometry.minimal._seven_point_kernels import four_point, seven_point
 from sfm.core.robust import _two_view_kernels as kernels
 from sfm.core.robust.ransac import CompiledProblem, Solver
 
@@ -19,7 +17,7 @@ def essential_matrix(
     data[:3], data[3:6] = rays1.T, rays2.T
     data[6:12], data[12:] = jacobians1.reshape(-1, 6).T, jacobians2.reshape(-1, 6).T
     return CompiledProblem(
-        kernels.TwoViews(kernels.ESSENTIAL, data), Solver(five_point, 5, 10, restarts=4, reach=3.0), max_error_px
+        kernels.TwoViews(kernels.ESSENTIAL, data), Solver(5, 10, restarts=4, reach=3.0), max_error_px
     )
 
 
@@ -27,7 +25,7 @@ def fundamental_matrix(columns: FloatArray, max_error: float) -> CompiledProblem
     """x2ᵀ F x1 = 0 on points (4, N) near the origin."""
     return CompiledProblem(
         kernels.TwoViews(kernels.FUNDAMENTAL, np.ascontiguousarray(columns)),
-        Solver(seven_point, 7, 3, restarts=4),
+        Solver(7, 3, restarts=4),
         max_error,
     )
 
@@ -36,7 +34,7 @@ def homography_matrix(columns: FloatArray, max_error: float) -> CompiledProblem:
     """x2 ~ H x1 on points (4, N) near the origin."""
     return CompiledProblem(
         kernels.TwoViews(kernels.HOMOGRAPHY, np.ascontiguousarray(columns)),
-        Solver(four_point, 4, 1, restarts=1, effort=0.5),
+        Solver(4, 1, restarts=1, effort=0.5),
         max_error,
     )
 

@@ -11,7 +11,7 @@ from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._absolute_pose_kernels import equations as pose_equations
 from sfm.core.robust._damping_kernels import damped_step
-from sfm.core.robust._loop_kernels import score
+from sfm.core.robust._loop_kernels import Stopping, score
 from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED, robust_weight
 from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
@@ -163,6 +163,36 @@ def test_true_models_are_plausible_for_every_sample():
     assert all(plausible(problem.data, model, rng.choice(40, 7, replace=False)) for _ in range(50))
 
 
+def test_no_model_is_given_up_before_any_has_set_a_bound():
+    for error in (0.1, 0.03, 0.01):
+        still = np.random.default_rng(0).uniform(-1, 1, (2, 64))
+        data = np.concatenate([still, still])
+        data[2:, :16] += 50.0  # the first block agrees with nothing
+        problem = homography_matrix(data, error)
+        bound, square = 64 * problem.max_error**2, problem.max_error**2
+        for patience in (3.0, 1e150):
+            _, inliers = score(problem.data, flat(np.eye(3)), TRUNCATED, square, bound, patience, np.empty(64))
+            assert inliers == 48
+
+
+def test_a_search_that_may_end_within_a_batch_refines_its_last_candidate():
+    """Whatever the number of samples that the first model asks for, no better minimal model goes unrefined."""
+    for least in range(20, 60, 3):
+        problem, _ = _still(count=200, wrong=0.3, seed=least)
+        samples = np.empty((100, 4), np.int64)
+        draw_samples(np.array([least + 1]), 200, samples)
+        stopping = Stopping(15, 100, 0.99, 1.0, least, 100, False)
+        bounds, model = np.full(2, 200 * problem.max_error**2), np.zeros(SIZE)
+        used, inliers = problem.search(samples, TRUNCATED, bounds, model, stopping=stopping)
+        assert used in (max(least, 20), 100) or used > least
+        assert inliers >= 15
+        expected, best = np.full(2, 200 * problem.max_error**2), np.zeros(SIZE)
+        done = 0
+        while done < used:
+            done += problem.search(samples[done:used], TRUNCATED, expected, best)[0]
+        assert bounds[1] <= expected[1] * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("loss", [TRUNCATED, MARGINALIZED])
 def test_the_search_finds_what_its_slow_twin_finds(loss):
     problem, _ = _still(count=200, seed=3)
@@ -219,7 +249,7 @@ def test_scores_reach_over_bounds_of_the_noise_up_to_eight_pixels():
     def reached(solver: Solver) -> list[float]:
         return [px * farthest_bound(solver, RansacConfig(max_error_px=px)) for px in (0.5, 1.0, 2.0, 4.0, 12.0)]
 
-    solver = Solver(print, 7, 3)
+    solver = Solver(7, 3)
     assert reached(solver) == [2.0, 4.0, 8.0, 8.0, 12.0]
     assert reached(solver._replace(reach=3.0)) == [1.5, 3.0, 6.0, 8.0, 12.0]
     assert farthest_bound(solver, RansacConfig(max_error_px=1.0, score="truncated")) == 1.0
