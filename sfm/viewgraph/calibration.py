@@ -28,7 +28,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.optimize import minimize
 
-from sfm.core.arrays import FloatArray, Points2D
+from sfm.core.arrays import FloatArray, Matrix3, Points2D
 from sfm.core.cameras import Camera
 from sfm.core.cameras.priors import DEFAULT_FOCAL_RATIO
 from sfm.core.geometry.epipolar import essential_from_fundamental, pose_from_essential
@@ -129,23 +129,35 @@ def poses_under(
     cameras: Mapping[int, Camera],
     image_cameras: Mapping[int, int],
 ) -> ViewGraph:
-    """The view graph with the relative poses of uncalibrated pairs taken from F and these cameras."""
+    """The view graph with the relative poses of uncalibrated pairs taken from F and these cameras.
+
+    Calibrated pairs without a pose, as COLMAP leaves them in its database, get that of E.
+    """
     pairs = dict(view_graph.pairs)
     for (i, j), geometry in view_graph.pairs.items():
+        camera1, camera2 = cameras[image_cameras[i]], cameras[image_cameras[j]]
         if geometry.kind == PairKind.UNCALIBRATED and geometry.F is not None:
-            points = keypoints[i][geometry.matches[:, 0]], keypoints[j][geometry.matches[:, 1]]
-            pairs[i, j] = _posed(geometry, points, cameras[image_cameras[i]], cameras[image_cameras[j]])
+            essential = essential_from_fundamental(geometry.F, camera1.calibration_matrix, camera2.calibration_matrix)
+        elif geometry.kind == PairKind.CALIBRATED and geometry.cam2_from_cam1 is None and geometry.E is not None:
+            essential = geometry.E
+        else:
+            continue
+        points = keypoints[i][geometry.matches[:, 0]], keypoints[j][geometry.matches[:, 1]]
+        pairs[i, j] = _posed(geometry, essential, points, camera1, camera2)
     return ViewGraph(pairs)
 
 
 def _posed(
-    geometry: TwoViewGeometry, points: tuple[Points2D, Points2D], camera1: Camera, camera2: Camera
+    geometry: TwoViewGeometry,
+    essential: Matrix3,
+    points: tuple[Points2D, Points2D],
+    camera1: Camera,
+    camera2: Camera,
 ) -> TwoViewGeometry:
     (rays1, valid1), (rays2, valid2) = camera1.unproject(points[0]), camera2.unproject(points[1])
     valid = valid1 & valid2
-    if geometry.F is None or not valid.any():
+    if not valid.any():
         return geometry
-    essential = essential_from_fundamental(geometry.F, camera1.calibration_matrix, camera2.calibration_matrix)
     pose, _ = pose_from_essential(essential, rays1[valid], rays2[valid])
     turned = pose.rotation @ rays1[valid]
     sine = np.linalg.norm(np.cross(turned, rays2[valid]), axis=1)

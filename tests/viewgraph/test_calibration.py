@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm.core.cameras import Camera
-from sfm.core.geometry.epipolar import essential_from_pose, fundamental_from_essential
+from sfm.core.geometry.epipolar import essential_from_fundamental, essential_from_pose, fundamental_from_essential
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
@@ -70,9 +70,17 @@ def test_pairs_without_a_matrix_leave_the_guess():
     assert calibrate_focal_lengths(graph, cameras, {1: 1, 2: 2}) == cameras
 
 
-def test_poses_follow_the_corrected_focal_lengths(rng):
+@pytest.mark.parametrize("kind", [PairKind.UNCALIBRATED, PairKind.CALIBRATED])
+def test_poses_follow_the_corrected_focal_lengths(rng, kind):
     graph, keypoints, poses = _scene(rng)
     truth = {i: _camera(f) for i, f in TRUE_FOCALS.items()}
+    if kind == PairKind.CALIBRATED:  # as COLMAP leaves them: with E, without a pose
+        K = {i: camera.calibration_matrix for i, camera in truth.items()}
+        pairs = {
+            (i, j): dataclasses.replace(one, kind=kind, E=essential_from_fundamental(one.F, K[i], K[j]), F=None)
+            for (i, j), one in graph.pairs.items()
+        }
+        graph = ViewGraph(pairs)
     posed = poses_under(graph, keypoints, truth, {i: i for i in TRUE_FOCALS})
     for (i, j), geometry in posed.pairs.items():
         motion = poses[j] @ poses[i].inverse()
