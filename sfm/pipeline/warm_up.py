@@ -50,7 +50,7 @@ def compile_kernels(observer: Observer, *, threads: int) -> None:
     folder = os.environ.get("NUMBA_CACHE_DIR")
     if folder is None or is_complete(Path(folder)) or os.environ.get("NUMBA_DISABLE_JIT", "0") != "0":
         return
-    observer(Note(message="compiling kernels (first run only), about 20 seconds on two cores"))
+    observer(Note(message="compiling kernels (first run only), about half a minute on two cores"))
     began = time.perf_counter()
     parts = list(_PARTS)
     try:

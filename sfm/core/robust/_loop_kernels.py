@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
 from sfm.core.robust._damping_kernels import damped_step
-from sfm.core.robust._loss_kernels import CAUCHY, TRUNCATED, robust_weight
+from sfm.core.robust._loss_kernels import TRUNCATED, robust_weight
 from sfm.core.robust._problem_kernels import (
     SIZE,
     equations,
@@ -21,42 +18,9 @@ from sfm.core.robust._problem_kernels import (
     squared_errors,
     start,
 )
-from sfm.core.robust._sampling_kernels import draw
 
 _BLOCK, _ROUND, _STEPS = 16, 20, 20
 _PATIENCE, _ALL = 3.0, 1e150
-
-
-class Stopping(NamedTuple):
-    """When a search ends: see `required_samples`.
-
-    Fewer than `inliers` inliers are none, and `hopeless` samples then suffice. If `at_once`, the caller decides anew
-    after each better model.
-    """
-
-    inliers: int
-    hopeless: int
-    confidence: float
-    factor: float
-    least: int
-    most: int
-    at_once: bool
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def required_samples(inliers, count, size, confidence, factor, least, most):
-    """Samples of which, but for 1 − `confidence`, one has inliers only, times `factor`; within `least` and `most`."""
-    if count < size:
-        return most
-    clean = 1.0
-    for i in range(size):
-        clean *= max(inliers - i, 0) / (count - i)
-    if clean >= 1 - 1e-12:
-        return least
-    if clean <= 1e-12:
-        return most
-    needed = math.ceil(factor * math.log(1 - confidence) / math.log1p(-clean))
-    return int(min(max(needed, least), most))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,80 +61,36 @@ def best_model(problem, models, loss, max_square, bound, squares):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(problem, some, samples, models, loss, max_square, tolerance, drawn, stopping, bounds, best):
-    """Solves samples one by one, until enough are drawn: how many were used, and the best model's inliers or −1.
+def search(problem, some, samples, models, loss, max_square, tolerance, bounds, best):
+    """Solves samples one by one until a model is better than all before: how many were used, and its inliers or −1.
 
-    There are `drawn` samples before these, and −1 stands for no better model than before. After every `_ROUND` samples
-    their best model is refined on `some` of the data, if it beats all minimal ones before. `bounds` (2,) are the lowest
-    scores so far of a minimal and of a refined model; the best model goes to `best`. `models` is scratch. Minimal
-    models, which chance has made exact for the sample and inexact for the rest, are ranked by the truncated loss: the
-    marginalised one looks at the sample above all.
+    After every `_ROUND` samples their best model is refined on `some` of the data, if it beats all minimal ones before.
+    `bounds` (2,) are the lowest scores so far of a minimal and of a refined model; the best model goes to `best`.
+    `models` is scratch. Minimal models, which chance has made exact for the sample and inexact for the rest, are ranked
+    by the truncated loss: the marginalised one looks at the sample above all.
     """
     squares, candidate = np.empty(problem.data.shape[1]), np.empty(SIZE)
-    improved, found, limit = False, -1, drawn + samples.shape[0]
+    improved = False
     for k in range(samples.shape[0]):
-        if drawn + k >= limit:
-            return k, found
         for n in range(solve(problem, samples[k : k + 1], models)):
             if not plausible(problem, models[n], samples[k]):
                 continue
             total = score(problem, models[n], TRUNCATED, max_square, bounds[0], _PATIENCE, squares)[0]
             if total < bounds[0]:
                 bounds[0], improved = total, True
-                candidate[:] = models[n]
-        if improved and ((k + 1) % _ROUND == 0 or k + 1 == samples.shape[0] or drawn + k + 1 >= limit):
+                # Not by slices, whose errors have messages that take a second and a half to compile.
+                for i in range(SIZE):
+                    candidate[i] = models[n, i]
+        if improved and ((k + 1) % _ROUND == 0 or k + 1 == samples.shape[0]):
             improved = False
             improve(some, candidate, loss, max_square, max_square, tolerance)
             total, inliers = score(problem, candidate, loss, max_square, bounds[1], _ALL, squares)
             if total < bounds[1]:
                 bounds[1] = total
-                best[:] = candidate
-                found = inliers
-                if stopping.at_once:
-                    return k + 1, found
-                if inliers >= stopping.inliers:
-                    limit = required_samples(
-                        inliers, squares.shape[0], samples.shape[1], stopping.confidence, stopping.factor,
-                        stopping.least, stopping.most,
-                    )  # fmt: skip
-                else:
-                    limit = stopping.hopeless
-    return samples.shape[0], found
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def search_inliers(problem, some, generator, rounds, samples, models, loss, max_square, inlier_square, tolerance,
-                   bounds, best):  # fmt: skip
-    """`rounds` more searches, of samples of the best model's inliers, its errors below `inlier_square`, alone.
-
-    Refinement of F ends in one of many local minima; the models of clean samples lie near most of them.
-    """
-    squares = np.empty(problem.data.shape[1])
-    squared_errors(problem, best, 0, len(squares), squares)
-    inliers = np.flatnonzero(squares < inlier_square)
-    if len(inliers) <= samples.shape[1]:
-        return
-    at_once = Stopping(0, 0, 0.5, 1.0, 0, 0, True)
-    for _ in range(rounds):
-        for k in range(samples.shape[0]):
-            draw(generator, len(inliers), samples.shape[1], samples[k])
-            for i in range(samples.shape[1]):
-                samples[k, i] = inliers[samples[k, i]]
-        bounds[0] = len(squares) * max_square
-        search(problem, some, samples, models, loss, max_square, tolerance, 0, at_once, bounds, best)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def polish(problem, model, medians, max_square, tolerance, squares):
-    """Refines a model by Cauchy's loss, at a scale of `medians` medians of |r| of the inliers; fills `squares`."""
-    squared_errors(problem, model, 0, len(squares), squares)
-    inliers = squares[squares < max_square]
-    if len(inliers) == 0:
-        return
-    middle = len(inliers) // 2
-    square_scale = max(medians**2 * np.partition(inliers, middle)[middle], 1e-6 * max_square)
-    improve(problem, model, CAUCHY, square_scale, max_square, tolerance)
-    squared_errors(problem, model, 0, len(squares), squares)
+                for i in range(SIZE):
+                    best[i] = candidate[i]
+                return k + 1, inliers
+    return samples.shape[0], -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

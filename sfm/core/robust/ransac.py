@@ -35,7 +35,7 @@ from sfm.core.robust import _loop_kernels as kernels
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._focal_resection_kernels import FocalResection
 from sfm.core.robust._focal_views_kernels import FocalViews
-from sfm.core.robust._loss_kernels import MARGINALIZED, TRUNCATED
+from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED
 from sfm.core.robust._problem_kernels import SIZE, solve
 from sfm.core.robust._two_view_kernels import TwoViews
 from sfm.core.robust.sampling import Sampler
@@ -43,10 +43,6 @@ from sfm.core.robust.sampling import Sampler
 _MEDIANS = 2.0
 """Scale of the final refinement, in medians of the |r| of the inliers. On pairs of four real sets the AUC at 1° is flat
 from 1.5 to 2; at 3.5, which is 95 % efficient on Gaussian noise, it is lower: the noise of keypoints has tails."""
-_RESTART = 20
-"""Samples of one search among the inliers."""
-AT_ONCE = kernels.Stopping(0, 0, 0.5, 1.0, 0, 0, True)
-"""Ends a search with the first better model."""
 # Local optimisation looks at no more data than these, since all of them wait for the end.
 LOCAL_DATA = 500
 _FARTHEST_PX = 8.0
@@ -125,46 +121,13 @@ class CompiledProblem:
         """The problem with another largest error of an inlier."""
         return CompiledProblem(self.data, self.solver, max_error)
 
-    def search(
-        self,
-        samples: np.ndarray,
-        loss: np.int64,
-        bounds: FloatArray,
-        best: FloatArray,
-        *,
-        drawn: int = 0,
-        stopping: kernels.Stopping = AT_ONCE,
-    ) -> tuple[int, int]:
+    def search(self, samples: np.ndarray, loss: np.int64, bounds: FloatArray, best: FloatArray) -> tuple[int, int]:
         """Looks for a better model among those of minimal samples, rows of indices; see `_loop_kernels`.
 
         Data must be in random order: models are given up for the first of them, and refined on the first of them.
         """
-        models = np.zeros((self.solver.max_solutions, SIZE))
-        return kernels.search(
-            self.data,
-            self.some,
-            samples,
-            models,
-            loss,
-            self.max_error**2,
-            LOCAL_TOLERANCE,
-            drawn,
-            stopping,
-            bounds,
-            best,
-        )
-
-    def search_inliers(
-        self, generator: np.ndarray, inlier_error: float, loss: np.int64, bounds: FloatArray, best: FloatArray
-    ) -> None:
-        """Replaces the model by a better one among those of samples of its inliers, if there is one."""
-        if not self.solver.restarts:
-            return
-        samples, models = np.empty((_RESTART, self.sample_size), np.int64), np.zeros((self.solver.max_solutions, SIZE))
-        kernels.search_inliers(
-            self.data, self.some, generator, self.solver.restarts, samples, models, loss, self.max_error**2,
-            inlier_error**2, LOCAL_TOLERANCE, bounds, best,
-        )  # fmt: skip
+        models, square = np.zeros((self.solver.max_solutions, SIZE)), self.max_error**2
+        return kernels.search(self.data, self.some, samples, models, loss, square, LOCAL_TOLERANCE, bounds, best)
 
     @property
     def some(self) -> TwoViews | Resection | FocalViews | FocalResection:
@@ -210,8 +173,15 @@ class Estimate:
 
 def required_iterations(inliers: int, count: int, sample_size: int, config: RansacConfig) -> int:
     """Samples needed to draw one of inliers only with the configured confidence, within the configured limits."""
-    limits = config.confidence, config.trials_factor, config.min_iterations, config.max_iterations
-    return kernels.required_samples(inliers, count, sample_size, *limits)
+    if count < sample_size:
+        return config.max_iterations
+    clean = math.prod(max(inliers - i, 0) / (count - i) for i in range(sample_size))
+    if clean >= 1 - 1e-12:
+        return config.min_iterations
+    if clean <= 1e-12:
+        return config.max_iterations
+    needed = config.trials_factor * math.log(1 - config.confidence) / math.log1p(-clean)
+    return int(min(max(math.ceil(needed), config.min_iterations), config.max_iterations))
 
 
 def ransac(
@@ -238,10 +208,8 @@ def ransac(
     # As long as no model has enough inliers, sampling ends when one would have been found.
     hopeful = dataclasses.replace(config, trials_factor=1.0)
     limit = hopeless = required_iterations(needed, problem.count, problem.sample_size, hopeful)
-    stopping = _stopping(config, needed, hopeless, at_once=sampler.order is not None)
     while sampler.used < limit:
-        samples = sampler.ahead(limit - sampler.used)
-        used, inliers = searched.search(samples, loss, bounds, model, drawn=sampler.used, stopping=stopping)
+        used, inliers = searched.search(sampler.ahead(limit - sampler.used), loss, bounds, model)
         sampler.use(used)
         if inliers < needed:
             limit = limit if inliers < 0 else hopeless
@@ -253,16 +221,24 @@ def ransac(
             sampler.restrict(reach)
     if not model.any():
         return Rejected("no_model", f"none of {sampler.used} samples gave one")
-    searched.search_inliers(sampler.generator, problem.max_error, loss, bounds, model)
+    _search_inliers(searched, problem.max_error, sampler, loss, bounds, model)
     model, squares = polish(wide, model)
     mask = squares < problem.max_error**2
     rejected = judged(mask, needed, config)
     return Estimate(model, float(bounds[1]), mask, sampler.used) if rejected is None else rejected
 
 
-def _stopping(config: RansacConfig, needed: int, hopeless: int, *, at_once: bool) -> kernels.Stopping:
-    bounds = config.min_iterations, config.max_iterations
-    return kernels.Stopping(needed, hopeless, config.confidence, config.trials_factor, *bounds, at_once)
+def _search_inliers(
+    problem: CompiledProblem, max_error: float, sampler: Sampler, loss: np.int64, bounds: FloatArray, model: FloatArray
+) -> None:
+    """Replaces the model by a better one among those of samples of its inliers alone, if there is one.
+
+    Refinement of F ends in one of many local minima; the models of clean samples lie near most of them.
+    """
+    inliers = np.flatnonzero(problem.squared_errors(model) < max_error**2)
+    for _ in range(problem.solver.restarts if len(inliers) > problem.sample_size else 0):
+        bounds[0] = problem.count * problem.max_error**2
+        problem.search(sampler.among(inliers), loss, bounds, model)
 
 
 def loss_of(config: RansacConfig) -> np.int64:
@@ -306,6 +282,11 @@ def judged(inliers: Mask, needed: int, config: RansacConfig) -> Rejected | None:
 
 def polish(problem: CompiledProblem, model: FloatArray) -> tuple[FloatArray, Vector]:
     """Final refinement with Cauchy's loss, cut off at the error bound, at a scale taken from the inliers; and r²."""
-    model, squares = model.copy(), np.empty(problem.count)
-    kernels.polish(problem.data, model, _MEDIANS, problem.max_error**2, _FINAL_TOLERANCE, squares)
-    return model, squares
+    squares = problem.squared_errors(model)
+    inliers = squares[squares < problem.max_error**2]
+    if not len(inliers):
+        return model, squares
+    median = np.partition(inliers, len(inliers) // 2)[len(inliers) // 2]
+    scale = max(_MEDIANS * math.sqrt(float(median)), 1e-3 * problem.max_error)
+    model = problem.improved(model, CAUCHY, scale, _FINAL_TOLERANCE)
+    return model, problem.squared_errors(model)

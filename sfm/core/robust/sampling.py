@@ -10,6 +10,8 @@ from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 BATCH = 50
 """Samples drawn at once, at first. Later as many as have been used, so that kernels are called a few times only."""
 
+_AMONG = 20
+
 
 class Sampler:
     """Samples of indices in a random order that is the same for a seed, however many of them are asked for at a time.
@@ -23,7 +25,7 @@ class Sampler:
         """For samples of `size` among `count` data; progressive samples are spread over `horizon` draws."""
         self.order = None if quality is None else np.argsort(-quality, kind="stable")
         self.count, self.horizon, self.reach, self.used = count, float(horizon), count, 0
-        self.generator, self._growth = rng.integers(1, 2**32, 1), np.zeros(3)
+        self._generator, self._growth = rng.integers(1, 2**32, 1), np.zeros(3)
         self._ahead = np.empty((0, size), np.int64)
 
     def ahead(self, most: int) -> np.ndarray:
@@ -31,9 +33,9 @@ class Sampler:
         if not len(self._ahead):
             self._ahead = np.empty((max(BATCH, self.used), self._ahead.shape[1]), np.int64)
             if self.order is None:
-                draw_samples(self.generator, self.count, self._ahead)
+                draw_samples(self._generator, self.count, self._ahead)
             else:
-                reach = (self.generator, self.used, self.reach, self.count, self.horizon, self._growth)
+                reach = (self._generator, self.used, self.reach, self.count, self.horizon, self._growth)
                 draw_progressively(*reach, self._ahead)
                 self._ahead = self.order[self._ahead]
         return self._ahead[:most]
@@ -46,3 +48,9 @@ class Sampler:
     def use(self, number: int) -> None:
         """Takes as many of the samples ahead away."""
         self._ahead, self.used = self._ahead[number:], self.used + number
+
+    def among(self, chosen: np.ndarray) -> np.ndarray:
+        """A few uniform samples of the indices `chosen`, of which there must be more than a sample has."""
+        samples = np.empty((_AMONG, self._ahead.shape[1]), np.int64)
+        draw_samples(self._generator, len(chosen), samples)
+        return chosen[samples]

@@ -11,7 +11,7 @@ from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.robust._absolute_pose_kernels import Resection
 from sfm.core.robust._absolute_pose_kernels import equations as pose_equations
 from sfm.core.robust._damping_kernels import damped_step
-from sfm.core.robust._loop_kernels import Stopping, score
+from sfm.core.robust._loop_kernels import score
 from sfm.core.robust._loss_kernels import CAUCHY, MARGINALIZED, TRUNCATED, robust_weight
 from sfm.core.robust._problem_kernels import SIZE
 from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
@@ -173,24 +173,6 @@ def test_no_model_is_given_up_before_any_has_set_a_bound():
         for patience in (3.0, 1e150):
             _, inliers = score(problem.data, flat(np.eye(3)), TRUNCATED, square, bound, patience, np.empty(64))
             assert inliers == 48
-
-
-def test_a_search_that_may_end_within_a_batch_refines_its_last_candidate():
-    """Whatever the number of samples that the first model asks for, no better minimal model goes unrefined."""
-    for least in range(20, 60, 3):
-        problem, _ = _still(count=200, wrong=0.3, seed=least)
-        samples = np.empty((100, 4), np.int64)
-        draw_samples(np.array([least + 1]), 200, samples)
-        stopping = Stopping(15, 100, 0.99, 1.0, least, 100, False)
-        bounds, model = np.full(2, 200 * problem.max_error**2), np.zeros(SIZE)
-        used, inliers = problem.search(samples, TRUNCATED, bounds, model, stopping=stopping)
-        assert used in (max(least, 20), 100) or used > least
-        assert inliers >= 15
-        expected, best = np.full(2, 200 * problem.max_error**2), np.zeros(SIZE)
-        done = 0
-        while done < used:
-            done += problem.search(samples[done:used], TRUNCATED, expected, best)[0]
-        assert bounds[1] <= expected[1] * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("loss", [TRUNCATED, MARGINALIZED])
