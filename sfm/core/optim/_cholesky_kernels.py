@@ -12,8 +12,16 @@ import math
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._tile_kernels import solve_tile, subtract_strip_product, subtract_two_strip_products
+from sfm.core.optim._tile_kernels import (
+    solve_tile,
+    subtract_strip_product,
+    subtract_strip_vector,
+    subtract_two_strip_products,
+    subtract_vector_strip,
+)
 
+PANEL = 32
+"""Strips of a panel: the columns of two strips fill the first cache."""
 GROUP = 32
 """Strips that stay in the second cache while others pass by."""
 
@@ -129,9 +137,7 @@ def solve_forward(L, at, pivots, end, x):
     """Solves with the pivots of a front from above, and subtracts what they are in the rows below."""
     for i in range(end):
         start, columns = at + strip_start(i, pivots), 8 * min(i, pivots)
-        for k in range(columns):
-            for r in range(8):
-                x[8 * i + r] -= L[start + 8 * k + r] * x[k]
+        subtract_strip_vector(x, 8 * i, L, start, columns)
         if i < pivots:
             tile = start + 64 * i
             for j in range(8):
@@ -151,6 +157,4 @@ def solve_backward(L, at, pivots, end, x):
                 for r in range(j + 1, 8):
                     x[8 * i + j] -= L[tile + 8 * j + r] * x[8 * i + r]
                 x[8 * i + j] *= L[tile + 9 * j]
-        for k in range(columns):
-            for r in range(8):
-                x[k] -= L[start + 8 * k + r] * x[8 * i + r]
+        subtract_vector_strip(x, 8 * i, L, start, columns)

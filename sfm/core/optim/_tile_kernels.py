@@ -6,6 +6,9 @@ is tile after tile. Both lie in a flat array, and a number says where they begin
     subtract_strip_product(C, c, A, x, y, k)               C −= X Yᵀ                        one tile
     subtract_two_strip_products(C, c0, c1, A, x0, x1, y, k)  C₀ −= X₀ Yᵀ,  C₁ −= X₁ Yᵀ     two tiles
     solve_tile(A, t, d)                                    T  = T D⁻ᵀ, D lower triangular with 1 / D_jj on its diagonal
+    subtract_strip_vector(x, i, A, a, k)                   x_i −= X x_0…k      eight numbers of a vector
+    subtract_vector_strip(x, i, A, a, k)                   x_0…k −= Xᵀ x_i
+    add_run(C, c, A, a, n)                                 at most eight numbers to others
 
 Numba's own loops would go through memory for each term; here a tile stays in registers until its sum is done. Two
 tiles at once fill the registers of AVX-512, four columns of one those of AVX2 and of NEON. The sum of an element runs
@@ -47,6 +50,21 @@ def solve_tile(A, t, d):
     for j in range(TILE):
         T[j] *= D[j, j]
         T[j + 1 :] -= D[j, j + 1 :, None] * T[j]
+
+
+def subtract_strip_vector(x, i, A, a, k):
+    """x[i : i + 8] −= X x[:k] for the strip at `a` of `k` columns."""
+    x[i : i + TILE] -= x[:k] @ A[a : a + TILE * k].reshape(k, TILE)
+
+
+def subtract_vector_strip(x, i, A, a, k):
+    """x[:k] −= Xᵀ x[i : i + 8] for the strip at `a` of `k` columns."""
+    x[:k] -= A[a : a + TILE * k].reshape(k, TILE) @ x[i : i + TILE]
+
+
+def add_run(C, c, A, a, n):
+    """C[c : c + n] += A[a : a + n] for n ≤ 8."""
+    C[c : c + n] += A[a : a + n]
 
 
 def _at(builder, pointer, offset):
@@ -140,6 +158,73 @@ def _solve(typing_context, A, t, d):
     return types.void(A, types.int64, types.int64), codegen
 
 
+def _data(context, builder, signature, args, *which):
+    return [make_array(signature.args[n])(context, builder, args[n]).data for n in which]
+
+
+@intrinsic
+def _strip_vector(typing_context, x, i, A, a, k):
+    def codegen(context, builder, signature, args):
+        data, numbers = _data(context, builder, signature, args, 0, 2)
+        place = _vector_at(builder, data, args[1])
+        total = cgutils.alloca_once_value(builder, _load(builder, place))
+        with cgutils.for_range(builder, args[4]) as loop:
+            column = builder.add(args[3], builder.mul(loop.index, _number(TILE)))
+            factor = _repeated(builder, _load(builder, _at(builder, data, loop.index)))
+            product = builder.fmul(_load(builder, _vector_at(builder, numbers, column)), factor, flags=_FLAGS)
+            builder.store(builder.fsub(builder.load(total), product, flags=_FLAGS), total)
+        builder.store(builder.load(total), place).align = 8
+        return context.get_dummy_value()
+
+    return types.void(x, types.int64, A, types.int64, types.int64), codegen
+
+
+@intrinsic
+def _vector_strip(typing_context, x, i, A, a, k):
+    def codegen(context, builder, signature, args):
+        data, numbers = _data(context, builder, signature, args, 0, 2)
+        factors = _load(builder, _vector_at(builder, data, args[1]))
+        with cgutils.for_range(builder, args[4]) as loop:
+            column = builder.add(args[3], builder.mul(loop.index, _number(TILE)))
+            parts = builder.fmul(_load(builder, _vector_at(builder, numbers, column)), factors)
+            for half in (4, 2, 1):
+                low, high = ([ir.Constant(_LANE, n) for n in range(f, f + half)] for f in (0, half))
+                kind = ir.VectorType(_LANE, half)
+                low, high = (builder.shuffle_vector(parts, parts, ir.Constant(kind, lanes)) for lanes in (low, high))
+                parts = builder.fadd(low, high)
+            place = _at(builder, data, loop.index)
+            builder.store(builder.fsub(_load(builder, place), builder.extract_element(parts, _LANE(0))), place)
+        return context.get_dummy_value()
+
+    return types.void(x, types.int64, A, types.int64, types.int64), codegen
+
+
+@intrinsic
+def _run(typing_context, C, c, A, a, n):
+    def codegen(context, builder, signature, args):
+        to, of = _data(context, builder, signature, args, 0, 2)
+        kind, mask = _VECTOR, ir.VectorType(ir.IntType(1), TILE)
+        lanes = ir.VectorType(_LANE, TILE)
+        count = builder.trunc(args[4], _LANE)
+        first = builder.insert_element(ir.Constant(lanes, ir.Undefined), count, _LANE(0))
+        counts = builder.shuffle_vector(first, first, ir.Constant(lanes, [0] * TILE))
+        inside = builder.icmp_signed("<", ir.Constant(lanes, list(range(TILE))), counts)
+        module, pointer = builder.module, kind.as_pointer()
+        load = cgutils.get_or_insert_function(
+            module, ir.FunctionType(kind, [pointer, _LANE, mask, kind]), "llvm.masked.load.v8f64.p0"
+        )
+        store = cgutils.get_or_insert_function(
+            module, ir.FunctionType(ir.VoidType(), [kind, pointer, _LANE, mask]), "llvm.masked.store.v8f64.p0"
+        )
+        zeros, place = ir.Constant(kind, [0.0] * TILE), _vector_at(builder, to, args[1])
+        added = builder.call(load, [_vector_at(builder, of, args[3]), _LANE(8), inside, zeros])
+        total = builder.fadd(builder.call(load, [place, _LANE(8), inside, zeros]), added)
+        builder.call(store, [total, place, _LANE(8), inside])
+        return context.get_dummy_value()
+
+    return types.void(C, types.int64, A, types.int64, types.int64), codegen
+
+
 @overload(subtract_strip_product)
 def _compiled_one(C, c, A, x, y, k):
     return lambda C, c, A, x, y, k: _one(C, c, A, x, y, k)  # pyright: ignore[reportCallIssue]
@@ -153,3 +238,18 @@ def _compiled_two(C, c0, c1, A, x0, x1, y, k):
 @overload(solve_tile)
 def _compiled_solve(A, t, d):
     return lambda A, t, d: _solve(A, t, d)  # pyright: ignore[reportCallIssue]
+
+
+@overload(subtract_strip_vector)
+def _compiled_strip_vector(x, i, A, a, k):
+    return lambda x, i, A, a, k: _strip_vector(x, i, A, a, k)  # pyright: ignore[reportCallIssue]
+
+
+@overload(subtract_vector_strip)
+def _compiled_vector_strip(x, i, A, a, k):
+    return lambda x, i, A, a, k: _vector_strip(x, i, A, a, k)  # pyright: ignore[reportCallIssue]
+
+
+@overload(add_run)
+def _compiled_run(C, c, A, a, n):
+    return lambda C, c, A, a, n: _run(C, c, A, a, n)  # pyright: ignore[reportCallIssue]

@@ -24,8 +24,6 @@ from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
 STRIP = 8
 """Rows of a strip."""
-_PANEL = 32
-"""Strips of a panel: the columns of two strips fill the first cache."""
 _SHARE_FROM = 150
 """Strips from which threads pay; handing out the work of a panel takes a third of a millisecond."""
 
@@ -82,8 +80,8 @@ def strips_size(unknowns: int) -> int:
 
 def factor_strips(L: FloatArray, strips: int, threads: int = 1) -> bool:
     """Overwrites the strips of S by those of L, with 1 / L_jj for L_jj; False where S is not positive definite."""
-    for first in range(0, strips, _PANEL):
-        last = min(first + _PANEL, strips)
+    for first in range(0, strips, kernels.PANEL):
+        last = min(first + kernels.PANEL, strips)
         if not kernels.factor_panel(L, 0, strips, first, last, first, last):
             return False
         eliminate_panel(L, 0, strips, strips, first, last, L, 0, threads)

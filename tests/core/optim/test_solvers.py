@@ -7,8 +7,9 @@ import pytest
 
 from sfm.core.optim.block_pattern import BlockPattern
 from sfm.core.optim.dense_cholesky import DenseCholesky
+from sfm.core.optim.sparse_cholesky import SparseCholesky
 
-exact = pytest.mark.parametrize("kind", [DenseCholesky], ids=lambda kind: kind.__name__)
+exact = pytest.mark.parametrize("kind", [DenseCholesky, SparseCholesky], ids=lambda kind: kind.__name__)
 
 
 def lower_blocks(S, pattern):
