@@ -170,9 +170,11 @@ def _schedule(fronts: Fronts) -> _Schedule:
     for root in roots:
         rest_at[root] = size
         size += int(sizes[root])
-    for job in (*jobs, top.tolist()):
+    # The fronts above come after all jobs, whose stacks are empty by then.
+    above = _stack(top.tolist(), parent, depth, sizes, kept, rest_at, size)
+    for job in jobs:
         size = _stack(job, parent, depth, sizes, kept, rest_at, size)
-    return _Schedule([np.array(job, np.int64) for job in jobs], top, rest_at, size)
+    return _Schedule([np.array(job, np.int64) for job in jobs], top, rest_at, max(size, above))
 
 
 def _stack(job, parent, depth, sizes, kept, rest_at, begin) -> int:

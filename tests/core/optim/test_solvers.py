@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from sfm.core.optim import dense_cholesky, sparse_cholesky
 from sfm.core.optim.block_pattern import BlockPattern
 from sfm.core.optim.dense_cholesky import DenseCholesky
+from sfm.core.optim.ordering import find_fronts
+from sfm.core.optim.preconditioners import BlockJacobi
+from sfm.core.optim.solvers import ReducedSolver, choose_solver
 from sfm.core.optim.sparse_cholesky import SparseCholesky
 
 exact = pytest.mark.parametrize("kind", [DenseCholesky, SparseCholesky], ids=lambda kind: kind.__name__)
@@ -77,17 +83,20 @@ def test_what_is_not_positive_definite_or_not_finite_has_no_factor(kind, rng):
 
 
 @exact
-def test_the_bits_do_not_depend_on_the_number_of_threads(kind, rng):
-    pattern, S = random_system(rng, 210, 9000)
-    held, side = rng.random(1260) < 0.02, rng.normal(size=1260)
-    solutions = []
-    for threads in (1, 2, 3):
-        solver = kind(pattern, held)
-        assert solver.factor(lower_blocks(S, pattern), np.ones(1260), threads)
-        solutions.append(solver.solve(side))
-    np.testing.assert_array_equal(solutions[0], solutions[1])
-    np.testing.assert_array_equal(solutions[0], solutions[2])
-    np.testing.assert_allclose(solutions[0], reference(S, np.ones(1260), held, side), atol=1e-12)
+def test_the_bits_do_not_depend_on_the_number_of_threads(kind, rng, monkeypatch):
+    monkeypatch.setattr(dense_cholesky, "_SHARE_FROM", 5)
+    monkeypatch.setattr(sparse_cholesky, "_WORTH_SHARING_S", 0.0)
+    for pattern, S in (random_system(rng, 100, 800), random_system(rng, 150, 250)):
+        n = 6 * pattern.rows
+        held, side = rng.random(n) < 0.02, rng.normal(size=n)
+        solutions = []
+        for threads in (1, 2, 3):
+            solver = kind(pattern, held)
+            assert solver.factor(lower_blocks(S, pattern), np.ones(n), threads)
+            solutions.append(solver.solve(side))
+        np.testing.assert_array_equal(solutions[0], solutions[1])
+        np.testing.assert_array_equal(solutions[0], solutions[2])
+        np.testing.assert_allclose(solutions[0], reference(S, np.ones(n), held, side), atol=1e-12)
 
 
 @exact
@@ -98,3 +107,76 @@ def test_badly_scaled_systems_are_solved_to_a_small_residual(kind, rng):
     assert solver.factor(lower_blocks(S, pattern), np.zeros(120), 1)
     scale = np.sqrt(np.diag(S))
     np.testing.assert_allclose((S @ solver.solve(side) - side) / scale, 0, atol=1e-9 * np.abs(side / scale).max())
+
+
+def test_rows_on_their_own_are_solved_by_all_alike(rng):
+    pattern, S = random_system(rng, 30, 0)
+    held, damping, side = rng.random(180) < 0.3, rng.random(180), rng.normal(size=180)
+    held[:6] = True
+    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+        solver = kind(pattern, held)
+        assert solver.factor(lower_blocks(S, pattern), damping, 1)
+        np.testing.assert_allclose(solver.solve(side), reference(S, damping, held, side), rtol=0, atol=1e-13)
+
+
+def test_all_solvers_are_reduced_solvers():
+    pattern, held = BlockPattern.full(2), np.zeros(12, bool)
+    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+        assert isinstance(kind(pattern, held), ReducedSolver)
+
+
+def street(rows, reach=6, loops=((0, 200), (100, 250))):
+    """Images along a street, each of which sees what the next few see, and places that are seen twice."""
+    ahead = [(i, i + d) for i in range(rows) for d in range(1, reach + 1) if i + d < rows]
+    again = [(a + i, b + i) for a, b in loops for i in range(10)]
+    return BlockPattern.of_pairs(rows, *np.array(ahead + again).T)
+
+
+def with_border(pattern):
+    """One more row, the first, that is coupled to all."""
+    rows = np.repeat(np.arange(pattern.rows), np.diff(pattern.offsets)) + 1
+    every = np.arange(1, pattern.rows + 1)
+    ends = np.concatenate([rows, every]), np.concatenate([pattern.columns + 1, 0 * every])
+    return BlockPattern.of_pairs(pattern.rows + 1, *ends)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "kind"),
+    [
+        (street(300), SparseCholesky),
+        (with_border(street(300)), SparseCholesky),
+        (BlockPattern.full(220), DenseCholesky),
+        (BlockPattern.of_pairs(250, *np.random.default_rng(1).integers(0, 250, (2, 4000))), DenseCholesky),
+        (street(60, loops=()), DenseCholesky),
+    ],
+    ids=["street", "border", "object", "random", "small"],
+)
+def test_the_cheaper_solver_is_chosen(pattern, kind):
+    solver, forecast = choose_solver(pattern, np.zeros(6 * pattern.rows, bool))
+    assert type(solver) is kind
+    assert forecast.kind == ("dense" if kind is DenseCholesky else "sparse")
+
+
+@pytest.mark.parametrize("kind", ["dense", "sparse"])
+def test_the_solver_that_is_asked_for_is_taken_and_its_memory_is_forecast(kind, rng):
+    pattern, held = street(300), rng.random(1800) < 0.05
+    solver, forecast = choose_solver(pattern, held, kind)
+    assert forecast.kind == kind
+    tracemalloc.start()
+    try:
+        fronts = find_fronts(pattern, held)
+        before = tracemalloc.get_traced_memory()[0]
+        again = DenseCholesky(pattern, held) if kind == "dense" else SparseCholesky(pattern, held, fronts)
+        taken = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert type(again) is type(solver)
+    assert 0.8 * taken < forecast.bytes < 1.2 * taken
+
+
+def test_a_sparse_factor_of_a_street_takes_a_small_part_of_the_work_of_a_dense_one():
+    for pattern in (street(300), with_border(street(300))):
+        held = np.zeros(6 * pattern.rows, bool)
+        sparse, dense = choose_solver(pattern, held, "sparse")[1], choose_solver(pattern, held, "dense")[1]
+        assert sparse.operations < 0.05 * dense.operations
+        assert sparse.bytes < 0.3 * dense.bytes

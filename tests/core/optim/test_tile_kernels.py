@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from sfm.core.optim import _tile_kernels as tiles
-from sfm.core.optim._tile_kernels import solve_tile, subtract_strip_product, subtract_two_strip_products
+from sfm.core.optim._tile_kernels import (
+    add_run,
+    solve_tile,
+    subtract_strip_product,
+    subtract_strip_vector,
+    subtract_two_strip_products,
+    subtract_vector_strip,
+)
 
 
 @nb.njit
@@ -49,3 +56,28 @@ def test_narrow_registers_give_the_same_bits_as_wide_ones(rng, monkeypatch):
         both(result := C.copy(), A, 50)
         results.append(result)
     np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize("n", range(1, 9))
+def test_strips_times_vectors_and_runs_equal_the_plain_ones(rng, n):
+    @nb.njit
+    def both(x, A, y, k):
+        subtract_strip_vector(x, 40, A, 8, k)
+        subtract_vector_strip(y, 40, A, 8, k)
+        add_run(x, 3, A, 5, k)
+
+    A, x, y = rng.normal(size=8 * n + 16), rng.normal(size=48), rng.normal(size=48)
+    both(got_x := x.copy(), A, got_y := y.copy(), n)
+    both.py_func(x, A, y, n)
+    np.testing.assert_allclose(got_x, x, atol=1e-14)
+    np.testing.assert_allclose(got_y, y, atol=1e-14)
+
+
+def test_a_run_changes_nothing_beside_it(rng):
+    @nb.njit
+    def run(C, A, n):
+        add_run(C, 2, A, 0, n)
+
+    for n in range(9):
+        run(C := np.zeros(12), np.ones(8), n)
+        np.testing.assert_array_equal(C, (np.arange(12) >= 2) & (np.arange(12) < 2 + n))
