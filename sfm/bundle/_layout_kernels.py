@@ -66,3 +66,16 @@ def marked_blocks(marked):
                 columns[k] = j
                 k += 1
     return offsets, columns
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def count_pairs(starts, slot, offsets, columns, out):
+    """Adds to each block of a pattern how many points couple the two rows."""
+    for p in range(len(starts) - 1):
+        for a in range(starts[p], starts[p + 1]):
+            at, end = offsets[slot[a]], offsets[slot[a] + 1]
+            for b in range(starts[p], a):
+                while at < end and columns[at] < slot[b]:
+                    at += 1
+                if at < end and columns[at] == slot[b]:
+                    out[at] += 1.0

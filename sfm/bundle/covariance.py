@@ -85,9 +85,10 @@ def covariance(
     Takes some 32 N² bytes for N free entries of poses, cameras and sensors.
 
     Returns:
-        `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave open as detail.
+        `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave
+        open as detail.
     """
-    system, _ = system_of(problem, config, threads)
+    system, _ = system_of(problem, dataclasses.replace(config, solver="dense"), threads)
     layout, (cost, _) = system.layout, system.linearize()
     known = system.information()
     motions = _motions(problem, layout)

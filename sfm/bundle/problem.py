@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
@@ -14,6 +14,8 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
 from sfm.core.optim.losses import Loss
+
+SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "iterative"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -165,12 +167,16 @@ class BundleConfig:
     """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
     gauge: Literal["two_cameras", "free"] = "two_cameras"
     """Hold one pose and one direction of motion of a second where the data leave them open, or hold nothing."""
+    solver: SolverChoice = "auto"
+    """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
         if not self.loss_scale_px > 0:
             raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if self.solver not in get_args(SolverChoice):
+            raise ValueError(f"solver must be one of {', '.join(get_args(SolverChoice))}, got {self.solver!r}")
         if self.gauge not in ("two_cameras", "free"):
             raise ValueError(f"gauge must be two_cameras or free, got {self.gauge!r}")
 

@@ -25,19 +25,16 @@ import numpy as np
 from sfm.bundle import _kernels as kernels
 from sfm.bundle.layout import SENSOR_COLUMN, Layout
 from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
+from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import ordered_map
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from sfm.core.optim._block_kernels import WIDTH
-from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial
 from sfm.core.optim.losses import loss_id
-from sfm.core.optim.schur import Couplings, eliminate, invert_blocks
-from sfm.core.optim.solvers import DenseCholesky
+from sfm.core.optim.schur import Couplings, invert_blocks
 
-_FLOOR = 1e-8
-"""Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
 
@@ -62,11 +59,9 @@ class BundleSystem:
         self._trial = self._state.copy()
 
         images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
-        poses, rows = len(layout.slot_frame), layout.rows
         self.held = layout.padding
-        self.held[:poses] |= held
-        self._h, self._F = np.empty((images, BLOCK)), np.empty((images, BLOCK, widest))
-        self._G, self._f = np.empty((images, widest, widest)), np.empty((images, widest))
+        self.held[: len(held)] |= held
+        self._images = ImageSums.allocate(images, widest)
         self._of_observations = np.empty((len(layout.image), 9 + 3 * widest))
         self._costs = np.empty(len(layout.image))
         self._V, self._g, self._M = np.empty((points, 6)), np.empty((points, 3)), np.empty((points, 6))
@@ -74,12 +69,8 @@ class BundleSystem:
             layout.starts, layout.slot, np.empty((len(layout.slot), 6)),
             layout.shared_starts, layout.shared_slot, np.empty((len(layout.shared_slot), 3, BLOCK)),
         )  # fmt: skip
-        self._pattern = BlockPattern.full(rows)
-        self._solver = DenseCholesky(self._pattern, self.held.ravel())
-        self._blocks, self._side = np.zeros((len(self._pattern.columns), BLOCK, WIDTH)), np.zeros((rows, WIDTH))
-        self._own = _OwnBlocks(layout, self._pattern)
-        self._row_ranges = layout.row_ranges(max(threads, 1))
-        self._gradient = self._diagonal = np.zeros((rows, BLOCK))
+        plan = plan_solver(layout, self.held, config.solver)
+        self._reduced = ReducedSystem(layout, self.held, self._couplings, plan, threads)
         self._expected, self._prior_weight = _priors(problem, layout)
 
     @property
@@ -117,6 +108,16 @@ class BundleSystem:
         return dataclasses.replace(self._rigs, rigs_from_world=now.frames, sensors_from_rig=now.sensors)
 
     @property
+    def gradient(self) -> FloatArray:
+        """(rows, 6) of the cost by what is left after the elimination, as last linearised; 0 where held."""
+        return self._reduced.gradient
+
+    @property
+    def plan(self) -> SolverPlan:
+        """How the reduced system is solved."""
+        return self._reduced.plan
+
+    @property
     def lost(self) -> int:
         """Observations without a projection at the current parameters."""
         return self._state.lost
@@ -124,8 +125,9 @@ class BundleSystem:
     def linearize(self) -> tuple[float, float]:
         """Cost and largest entry of the gradient at the current parameters."""
         lay, now, links = self.layout, self._state, self._couplings
-        for sums in (self._h, self._F, self._G, self._f, links.B):
-            sums.fill(0)
+        sums = self._images
+        sums.clear()
+        links.B.fill(0)
         rotations, translations, _ = now.images
         centers, limits = now.centers[lay.slot_frame], kernels.squared_limits(self._model_ids, now.params)
 
@@ -134,7 +136,7 @@ class BundleSystem:
                 *job, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
                 self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
                 rotations, translations, centers, now.params, now.points3D, *self._loss,
-                self._of_observations, self._h, self._F, self._G, self._f,
+                self._of_observations, sums.h, sums.F, sums.G, sums.f,
             )  # fmt: skip
 
         def points(job: tuple[int, int]) -> None:
@@ -145,31 +147,22 @@ class BundleSystem:
 
         cost = sum(self._run(images, lay.image_chunks)) + self._prior_cost(now.params)
         self._run(points, lay.point_chunks)
-        gradient = np.zeros((lay.rows, BLOCK))
-        self._own.set(self._F, self._G, self._prior_weight)
-        self._own.add_gradients(self._h, self._f, gradient)
-        gradient[len(lay.slot_frame) :] += self._prior_weight * self._unexpected(now.params)
-        self._own_gradient = gradient
-        self._gradient = np.where(self.held, 0.0, gradient)
-        largest = max(np.abs(self._gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
+        weight = self._prior_weight
+        self._reduced.take_over(sums, weight, weight * self._unexpected(now.params))
+        largest = max(np.abs(self._reduced.gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
         return float(cost), float(largest)
 
     def information(self) -> Information:
         """What the problem says about its parameters, as last linearised."""
         self._eliminate(0.0)
-        lower = DenseCholesky(self._pattern, np.zeros(6 * self.layout.rows, bool)).matrix(self._blocks[:, :, :BLOCK])
-        reduced = np.tril(lower) + np.tril(lower, -1).T
         centers = self._state.centers[self.layout.slot_frame]
-        return Information(reduced, self._couplings, centers, self._V, self._M)
+        return Information(self._reduced.matrix(), self._couplings, centers, self._V, self._M)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
         self._eliminate(damping)
-        scaling = damping * self._marquardt_diagonal()
-        if not self._solver.factor(self._blocks[:, :, :BLOCK], scaling.ravel(), self._threads):
-            return None
-        delta = self._solver.solve(self._side[:, :BLOCK].ravel()).reshape(-1, BLOCK)
-        if not np.isfinite(delta).all():
+        delta = self._reduced.solve(damping)
+        if delta is None:
             return None
         lay, now, then = self.layout, self._state, self._trial
         now.move(delta, lay, then)
@@ -195,7 +188,7 @@ class BundleSystem:
         cost, decrease, step, norm, lost = totals.sum(axis=0)
         cost += self._prior_cost(then.params)
         then.lost = int(lost)
-        decrease += 0.5 * float(np.sum(scaling * delta**2 - self._gradient * delta))
+        decrease += 0.5 * float(np.sum(self._reduced.scaling * delta**2 - self._reduced.gradient * delta))
         norm += np.sum(centers**2) + len(centers) + np.sum(now.params**2)
         return Trial(float(cost), float(decrease), float(np.sqrt(step + np.sum(delta**2))), float(np.sqrt(norm)))
 
@@ -228,31 +221,10 @@ class BundleSystem:
         return 0.5 * float(np.sum(self._prior_weight * self._unexpected(params) ** 2))
 
     def _eliminate(self, damping: float) -> None:
-        """Fills blocks, right-hand side and diagonal of the reduced system."""
-        lay, pattern = self.layout, self._pattern
-        self._blocks.fill(0)
-        self._own.add(self._blocks)
-        np.negative(self._own_gradient, out=self._side[:, :BLOCK])
-        self._diagonal = np.einsum("kaa->ka", self._blocks[pattern.diagonal, :, :BLOCK])
-        centers = self._state.centers[lay.slot_frame]
-        self._run(lambda job: invert_blocks(*job, self._V, damping, self._M), lay.point_chunks)
-
-        def rows(job: tuple[int, int]) -> None:
-            eliminate(
-                *job, *self._couplings, centers, self._state.points3D, self._M, self._g,
-                pattern.offsets, pattern.columns, self._blocks, self._side, self._diagonal,
-            )  # fmt: skip
-
-        self._run(rows, self._row_ranges)
-
-    def _marquardt_diagonal(self) -> FloatArray:
-        """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
-        poses = len(self.layout.slot_frame)
-        raised = []
-        for part in (self._diagonal[:poses], self._diagonal[poses:]):
-            largest = part.max(axis=0, initial=0.0)
-            raised.append(np.maximum(part, np.where(largest > 0, _FLOOR * largest, 1.0)))
-        return np.concatenate(raised)
+        """Inverts the blocks of points and takes them out of the reduced system."""
+        now = self._state
+        self._run(lambda job: invert_blocks(*job, self._V, damping, self._M), self.layout.point_chunks)
+        self._reduced.eliminate(now.centers[self.layout.slot_frame], now.points3D, self._M, self._g)
 
 
 class Information(NamedTuple):
@@ -268,70 +240,6 @@ class Information(NamedTuple):
     centers: np.ndarray
     V: np.ndarray
     M: np.ndarray
-
-
-class _OwnBlocks:
-    """What images contribute to shared rows and their couplings with poses, whatever becomes of the points."""
-
-    def __init__(self, layout: Layout, pattern: BlockPattern) -> None:
-        rows, slots = layout.image_shared, layout.image_slot
-        self._images, self._most = rows.shape
-        self._place = layout.column_place
-        self._shared, self._moving = rows >= 0, slots >= 0
-        self._coupled = self._shared & self._moving[:, None]
-        self._both = self._shared[:, :, None] & self._shared[:, None, :]
-        self._both &= np.tri(self._most, dtype=bool)
-        self._used = np.arange(layout.columns.shape[1]) < layout.column_count[:, None]
-        images, k = np.nonzero(self._coupled)
-        i, a, b = np.nonzero(self._both)
-        targets = [
-            pattern.numbers(rows[images, k], slots[images]),
-            pattern.numbers(rows[i, a], rows[i, b]),
-            pattern.diagonal[len(layout.slot_frame) :],
-        ]
-        self._scatter = _Scatter(np.concatenate(targets))
-        self._rows = _Scatter(np.concatenate([slots[self._moving], rows[self._shared]]))
-        self._blocks = np.zeros((0, 6, 6))
-
-    def set(self, F: FloatArray, G: FloatArray, prior_weight: FloatArray) -> None:
-        """Takes over the sums of a linearisation, and the weights of the priors on parameters (T, 6)."""
-        size = self._most * BLOCK
-        wide, square = np.zeros((self._images, size, BLOCK)), np.zeros((self._images, size, size))
-        image, k = np.nonzero(self._used)
-        wide[image, self._place[image, k]] = F[image, :, k]
-        lower = self._used[:, :, None] & self._used[:, None, :] & np.tri(self._used.shape[1], dtype=bool)
-        image, a, b = np.nonzero(lower)
-        values = G[image, a, b]
-        a, b = self._place[image, a], self._place[image, b]
-        square[image, a, b] = square[image, b, a] = values
-        square = square.reshape(self._images, self._most, BLOCK, self._most, BLOCK).transpose(0, 1, 3, 2, 4)
-        wide = wide.reshape(self._images, self._most, BLOCK, BLOCK)
-        priors = prior_weight[:, :, None] * np.eye(BLOCK)
-        self._blocks = self._scatter.sums(np.concatenate([wide[self._coupled], square[self._both], priors]))
-
-    def add(self, blocks: FloatArray) -> None:
-        """Adds them to the blocks of the reduced system."""
-        blocks[self._scatter.targets, :, :BLOCK] += self._blocks
-
-    def add_gradients(self, h: FloatArray, f: FloatArray, rows: FloatArray) -> None:
-        """Adds the gradients of the images' frames (I, 6) and columns (I, k) to the rows they belong to."""
-        wide = np.zeros((self._images, self._most * BLOCK))
-        image, k = np.nonzero(self._used)
-        wide[image, self._place[image, k]] = f[image, k]
-        shared = wide.reshape(self._images, self._most, BLOCK)[self._shared]
-        rows[self._rows.targets] += self._rows.sums(np.concatenate([h[self._moving], shared]))
-
-
-class _Scatter:
-    """Sums of rows that go to the same target, in the order of the rows."""
-
-    def __init__(self, targets: np.ndarray) -> None:
-        self._order = np.argsort(targets, kind="stable")
-        self.targets, self._starts = np.unique(targets[self._order], return_index=True)
-
-    def sums(self, values: FloatArray) -> FloatArray:
-        """The sums for `targets`."""
-        return np.add.reduceat(values[self._order], self._starts) if len(self._order) else values[:0]
 
 
 @dataclasses.dataclass(slots=True)

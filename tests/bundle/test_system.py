@@ -91,7 +91,7 @@ def system_of(problem, loss, gauge=False):
 
 def parts(system):
     """Gradient of the system in the order of `Slow`: padding and constant points left out."""
-    shared = system._gradient[~system.held]
+    shared = system.gradient[~system.held]
     return np.concatenate([shared, system._g[system.free_points].ravel()])
 
 
