@@ -109,6 +109,11 @@ def prior_residuals(prior: Prior, rotations: _Rotations, centers: _Centers, bias
             return ((lengths - prior.distances) / prior.sigmas)[:, None] * np.array([1.0, 0.0, 0.0])
 
 
+def point_prior_residuals(prior: PointPrior, points3D: Float64[np.ndarray, "P 3"]) -> FloatArray:
+    """(k, 3) residuals of control points in standard deviations, without the loss."""
+    return _point_residuals(prior, points3D)[1]
+
+
 def coupled(priors: Sequence[Prior], images: int) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (m,) of the pairs of unknowns, larger and smaller, that share a term; each pair once, sorted."""
     pairs, bias = [np.zeros((0, 2), np.int32)], images
