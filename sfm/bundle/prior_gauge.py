@@ -47,23 +47,25 @@ def open_motions(
 
 def entries_to_hold(
     priors: Sequence[Prior | PointPrior], centers: Float64[np.ndarray, "I 3"], points3D: Float64[np.ndarray, "P 3"],
-    anchor: int, second: int | None,
+    anchor: Float64[np.ndarray, " 3"], second: Float64[np.ndarray, " 3"] | None,
 ) -> tuple[Bool[np.ndarray, " 6"], Bool[np.ndarray, " 6"]]:  # fmt: skip
-    """Entries of the tangents of two cameras to hold so that what the priors leave open stands still.
+    """Entries of the tangents of two poses to hold so that what the priors leave open stands still.
 
     First as many entries of the anchor as that takes, then of the translation of the second. Without priors these are
     all six, and the largest along the baseline.
 
     Args:
-        second: None if the scene has no second camera; a motion that the anchor does not show stays open then.
+        centers, points3D: of all images and points, in the frame of the priors, at least roughly.
+        anchor, second: centres of the two poses, of images or of rigs; None if the scene has no second pose, and a
+            motion that the anchor does not show stays open then.
     """
     origin, size = _extent(centers)
     basis = open_motions(priors, centers, points3D)
     held = np.zeros((2, 6), bool)
-    for k, image in enumerate((anchor, second)):
-        if image is None:
+    for k, center in enumerate((anchor, second)):
+        if center is None:
             continue
-        shown = _moved(centers[image] - origin, size) @ basis
+        shown = _moved(center - origin, size) @ basis
         shown[: 3 * k] = 0
         basis = _held_still(basis, shown, held[k])
     return held[0], held[1]

@@ -12,6 +12,7 @@ from sfm.bundle.prior_terms import (
     coupled,
     linearize_point_priors,
     linearize_priors,
+    on_frames,
     point_prior_cost,
     prior_cost,
     prior_residuals,
@@ -117,6 +118,33 @@ def test_every_jacobian_agrees_with_complex_steps(rng, scale):
         numeric[:, column] = stepped.ravel().imag / 1e-20
     numeric[:, [c for c in range(6 * IMAGES, 6 * unknowns) if c % 6 > 2]] = 0
     np.testing.assert_allclose(dense(terms, unknowns), numeric, rtol=1e-6, atol=1e-9 * np.abs(numeric).max())
+
+
+def test_images_on_rigs_move_with_them(rng):
+    """Frames 0 to 2 carry images 0 and 1, 2 and 3, 4; mounts are fixed."""
+    frame_of, biases = rows(0, 0, 1, 1, 2), rng.normal(size=(2, 3))
+    priors = (*groups(rng), DistancePrior(rows(2), rows(3), np.ones(1), np.ones(1)))
+    turns, places = (values[:3] for values in poses(rng))
+    mounts, arms = Rotation3.exp(rng.normal(size=(IMAGES, 3))).matrix, rng.normal(size=(IMAGES, 3))
+
+    def images(delta):
+        """Rotations and centres of the images; an arm is in the axes of its frame."""
+        rotations, centers, moved_biases = moved(turns, places, biases, delta)
+        arms_in_world = np.einsum("iba,ib->ia", rotations[frame_of], arms)
+        return mounts @ rotations[frame_of], centers[frame_of] + arms_in_world, moved_biases
+
+    still = images(np.zeros((5, 6)))
+    _, terms = linearize_priors(priors, *still)
+    terms = on_frames(terms, frame_of, still[1] - places[frame_of], 3)
+    assert not np.any(terms.first == terms.second)
+    numeric = np.empty((terms.residuals.size, 30))
+    for column in range(30):
+        delta = np.zeros((5, 6), complex)
+        delta.flat[column] = 1e-20j
+        stepped = analytic_residuals(priors, *images(delta), (0.4, 2.0))
+        numeric[:, column] = stepped.ravel().imag / 1e-20
+    numeric[:, [c for c in range(18, 30) if c % 6 > 2]] = 0
+    np.testing.assert_allclose(dense(terms, 5), numeric, rtol=1e-6, atol=1e-9 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("loss", ["trivial", *ROBUST])
@@ -335,7 +363,7 @@ def held_without_priors(centers, anchor, second):
 
 def test_without_priors_two_cameras_are_held(rng):
     centers = rng.normal(size=(5, 3)) * 10 + 100
-    found = entries_to_hold((), centers, np.zeros((0, 3)), 1, 3)
+    found = entries_to_hold((), centers, np.zeros((0, 3)), centers[1], centers[3])
     np.testing.assert_array_equal(found, held_without_priors(centers, 1, 3))
 
 
@@ -343,14 +371,14 @@ def test_only_what_priors_leave_open_is_held(rng):
     centers, points = rng.normal(size=(5, 3)), np.zeros((0, 3))
 
     def held(*priors):
-        first, second = entries_to_hold(priors, centers, points, 0, 1)
+        first, second = entries_to_hold(priors, centers, points, centers[0], centers[1])
         return first.astype(int).tolist(), int(second.sum())
 
     assert held(at_positions(centers, range(5))) == ([0] * 6, 0)
     assert held(distance()) == ([1] * 6, 0)
     assert held(gravity((0.6, 0.0, 0.8))) == ([0, 0, 1, 1, 1, 1], 1)
     assert held(gravity((1.0, 0.0, 0.0)), distance()) == ([1, 0, 0, 1, 1, 1], 0)
-    alone, nothing = entries_to_hold((), centers[:1], points, 0, None)
+    alone, nothing = entries_to_hold((), centers[:1], points, centers[0], None)
     assert alone.all()
     assert not nothing.any()
 
@@ -361,7 +389,7 @@ def test_a_scene_that_is_held_cannot_move(rng):
     centers = poses_now.center
     for priors in ((), (gravity(),), (distance(),), (at_positions(centers, [0]),), (at_positions(centers, [2, 3]),)):
         basis = open_motions(priors, centers, np.zeros((0, 3)))
-        first, second = entries_to_hold(priors, centers, np.zeros((0, 3)), 0, 1)
+        first, second = entries_to_hold(priors, centers, np.zeros((0, 3)), centers[0], centers[1])
         assert first.sum() + second.sum() == basis.shape[1]
         origin = centers.mean(axis=0)
         size = np.linalg.norm(centers - origin, axis=1).max()
