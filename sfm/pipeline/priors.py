@@ -33,6 +33,8 @@ from sfm.io.exif import read_image_info
 from sfm.io.measurements import ControlPoints, MeasuredDirections, MeasuredDistances, MeasuredPositions
 
 _DOWN = np.array([0.0, 0.0, -1.0])
+_UNLIKELY = np.sqrt([0.0, 9.0, 11.829, 14.156])
+"""Lengths that as many normal numbers, 0 to 3, exceed with the probability by which one exceeds 3."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,8 +153,8 @@ def positions_of_photos(folder: Path, names: Collection[str]) -> MeasuredPositio
 def deviations(
     priors: ModelPriors, model: Reconstruction, biases: FloatArray
 ) -> dict[str, dict[str, float | int | list[float]]]:
-    """For each kind: how many there are, how many deviate by more than three standard deviations, and their root mean
-    square in standard deviations of one coordinate; about 1 where these are right.
+    """For each kind: how many there are, how many deviate by more than one in 370 would by chance, as three standard
+    deviations of one number, and the root mean square of all numbers in standard deviations; 1 where these are right.
 
     Args:
         biases: (G, 3) of the groups that have one.
@@ -167,24 +169,26 @@ def deviations(
         if biased:
             told[kind]["bias"] = [float(b) for b in bias]
     for prior in priors.of_points:
-        told["control points"] = _deviation(point_prior_residuals(prior, model.points3D), 3)
+        told["control points"] = _deviation(point_prior_residuals(prior, model.points3D), _coordinates(prior))
     return told
 
 
-def _deviation(residuals: FloatArray, coordinates: int) -> dict[str, float | int | list[float]]:
-    lengths = np.linalg.norm(residuals, axis=1)
-    rms = float(np.sqrt(np.mean(lengths**2) / coordinates)) if len(lengths) else 0.0
-    return {"count": len(lengths), "beyond_3_sigma": int(np.sum(lengths > 3)), "rms_sigmas": rms}
+def _deviation(residuals: FloatArray, coordinates: np.ndarray) -> dict[str, float | int | list[float]]:
+    """Of residuals (k, 3) with so many coordinates (k,) each."""
+    lengths, total = np.linalg.norm(residuals, axis=1), int(coordinates.sum())
+    rms = float(np.sqrt(np.sum(lengths**2) / total)) if total else 0.0
+    return {"count": len(lengths), "unlikely": int(np.sum(lengths > _UNLIKELY[coordinates])), "rms_sigmas": rms}
 
 
-def _coordinates(prior: Prior) -> int:
+def _coordinates(prior: Prior | PointPrior) -> np.ndarray:
+    """(k,) how many numbers each measurement is."""
     match prior:
-        case PositionPrior():
-            return 3
+        case PositionPrior() | PointPrior():
+            return np.isfinite(np.einsum("kaa->ka", prior.covariances)).sum(axis=1)
         case GravityPrior():
-            return 2
+            return np.full(len(prior.images), 2)
         case DistancePrior():
-            return 1
+            return np.full(len(prior.first), 1)
 
 
 def _matched(model: Reconstruction, names: tuple[str, ...], what: str) -> tuple[np.ndarray, np.ndarray]:

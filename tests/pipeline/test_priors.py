@@ -203,7 +203,7 @@ def test_deviations_are_counted_in_standard_deviations(model):
     priors = priors_of(model, measured, dataclasses.replace(SURE, position_bias=1.0))
     told = deviations(priors, model, np.full((1, 3), 0.5))
     assert told["positions"]["count"] == IMAGES
-    assert told["positions"]["beyond_3_sigma"] == 1
+    assert told["positions"]["unlikely"] == 1
     assert told["positions"]["rms_sigmas"] == pytest.approx(10 / np.sqrt(3 * IMAGES))
     assert told["positions"]["bias"] == [0.5, 0.5, 0.5]
     assert told["control points"]["rms_sigmas"] == 0.0
