@@ -6,7 +6,8 @@ The first line names the columns, in any order; empty lines and those that begin
     name,latitude,longitude[,altitude,…]     the same in degrees and metres, WGS84; sx, sy, sz are east, north, up
     name,x,y,z[,sigma_deg]                   which way is down, in the camera: x right, y down, z forward
     name1,name2,distance[,sigma]             how far apart two photos were taken
-    point,x,y,z[,sx,sy,sz]                   where a point of the model lies, by its id
+    point,x,y,z[,sx,sy,sz]                   where a point lies: one of the model by its id, or one that is marked
+    point,name,x,y                           where a point is marked in a photo, in px, the first centre (0.5, 0.5)
 
 An empty z, altitude or sigma is one that was not measured, or not given.
 """
@@ -21,7 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from sfm.core.arrays import Value, readonly
 from sfm.core.errors import FormatError
@@ -80,16 +81,29 @@ class MeasuredDistances(Value):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class ControlPoints(Value):
-    """Where points of a model lie: point_ids (k,), positions (k, 3) and sigmas (k, 3), NaN where not given."""
+    """Where points lie: positions (k, 3), NaN where not measured, and sigmas (k, 3), NaN where not given."""
 
-    point_ids: Int64[np.ndarray, " k"]
+    labels: tuple[str, ...]
     positions: Float64[np.ndarray, "k 3"]
     sigmas: Float64[np.ndarray, "k 3"]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "point_ids", readonly(self.point_ids, (None,), np.int64))
         for name in ("positions", "sigmas"):
-            object.__setattr__(self, name, readonly(getattr(self, name), (len(self.point_ids), 3)))
+            object.__setattr__(self, name, readonly(getattr(self, name), (len(self.labels), 3)))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Marks(Value):
+    """Where points are marked in photos: the label of the point and the name of the photo of each, points2D (k, 2)."""
+
+    labels: tuple[str, ...]
+    names: tuple[str, ...]
+    points2D: Float64[np.ndarray, "k 2"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points2D", readonly(self.points2D, (len(self.labels), 2)))
+        if len(self.names) != len(self.labels):
+            raise ValueError(f"{len(self.names)} names for {len(self.labels)} marks")
 
 
 def read_positions(path: Path | str) -> MeasuredPositions:
@@ -129,13 +143,24 @@ def read_distances(path: Path | str) -> MeasuredDistances:
 
 
 def read_control_points(path: Path | str) -> ControlPoints:
-    """Where points of a model lie, by the ids of the points. Raises as `read_positions`."""
+    """Where points lie. Raises as `read_positions`."""
     table = _Table.read(path, ("point",), (_PLACE,), _SIGMAS)
     positions = np.stack([table.numbers("x"), table.numbers("y"), table.numbers("z", gaps=True)], 1)
-    table.once("point")
-    ids = table.numbers("point")
-    table.check("point", (ids >= 0) & (ids == np.floor(ids)) & (ids < 2**53), "points have whole numbers")
-    return ControlPoints(ids.astype(np.int64), positions, table.sigmas())
+    return ControlPoints(table.once("point"), positions, table.sigmas())
+
+
+def read_marks(path: Path | str) -> Marks:
+    """Where points are marked in photos; a point once in each. Raises as `read_positions`."""
+    table = _Table.read(path, ("point", "name"), (("x", "y"),), ())
+    labels, names = table.texts("point"), table.texts("name")
+    table.check("point", _firsts(list(zip(labels, names, strict=True))), "it is marked twice in this photo")
+    return Marks(tuple(labels), tuple(names), np.stack([table.numbers("x"), table.numbers("y")], 1))
+
+
+def _firsts(items: Sequence[tuple[str, str]]) -> np.ndarray:
+    """(k,) whether none of the items before is the same."""
+    first = {item: k for k, item in reversed(list(enumerate(items)))}
+    return np.array([first[item] == k for k, item in enumerate(items)], bool)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

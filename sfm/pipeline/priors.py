@@ -30,7 +30,7 @@ from sfm.core.optim.losses import Loss
 from sfm.core.scene import Reconstruction
 from sfm.evaluation.compare import match_names
 from sfm.io.exif import read_image_info
-from sfm.io.measurements import ControlPoints, MeasuredDirections, MeasuredDistances, MeasuredPositions
+from sfm.io.measurements import ControlPoints, Marks, MeasuredDirections, MeasuredDistances, MeasuredPositions
 
 _DOWN = np.array([0.0, 0.0, -1.0])
 _UNLIKELY = np.sqrt([0.0, 9.0, 11.829, 14.156])
@@ -65,12 +65,13 @@ class PriorConfig:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Measurements(Value):
-    """All that was measured of a scene."""
+    """All that was measured of a scene. Control points are points of the model, or those marked if there are marks."""
 
     positions: MeasuredPositions | None = None
     directions: MeasuredDirections | None = None
     distances: MeasuredDistances | None = None
     control_points: ControlPoints | None = None
+    marks: Marks | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +127,7 @@ def priors_of(model: Reconstruction, measured: Measurements, config: PriorConfig
         absent += len(distances.names) - len(priors[-1].first)
     if (control := measured.control_points) is not None:
         points.append(_control(model, control, config, settings))
-        absent += len(control.point_ids) - len(points[0].points)
+        absent += len(control.labels) - len(points[0].points)
     return ModelPriors(tuple(priors), tuple(points), tuple(kinds), origin, absent)
 
 
@@ -241,11 +242,12 @@ def _distances(
 def _control(
     model: Reconstruction, control: ControlPoints, config: PriorConfig, settings: Mapping[str, Any]
 ) -> PointPrior:
-    row_of = {int(point_id): row for row, point_id in enumerate(model.point_ids)}
-    kept = [k for k, point_id in enumerate(control.point_ids) if int(point_id) in row_of]
+    row_of = {str(point_id): row for row, point_id in enumerate(model.point_ids.tolist())}
+    kept = [k for k, label in enumerate(control.labels) if label in row_of]
     if not kept:
-        raise InputError("no control point is a point of the model", remedy="points are named by their ids in it")
-    rows = np.array([row_of[int(control.point_ids[k])] for k in kept], np.int32)
+        remedy = "points are named by their ids in the model, or as they are marked in photos"
+        raise InputError("no control point is a point of the model", remedy=remedy)
+    rows = np.array([row_of[control.labels[k]] for k in kept], np.int32)
     places = control.positions[kept]
     sigmas = _completed(control.sigmas[kept], config.control_sigma, "control points", "control-sigma")
     return PointPrior(rows, places, covariances_of(np.where(np.isnan(places), np.inf, sigmas)), **settings)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm.core.errors import FormatError, InputError
-from sfm.io.measurements import read_control_points, read_directions, read_distances, read_positions
+from sfm.io.measurements import read_control_points, read_directions, read_distances, read_marks, read_positions
 
 
 @pytest.fixture
@@ -49,8 +49,15 @@ def test_distances_and_control_points_are_read(table):
     assert read.names == (("a", "b"), ("a", "c"))
     np.testing.assert_array_equal(read.distances, [2.5, 0])
     points = read_control_points(table("point,x,y,z,sx,sy,sz\n12,1,2,3,1,1,1\n7,0,0,0,,,\n"))
-    np.testing.assert_array_equal(points.point_ids, [12, 7])
+    assert points.labels == ("12", "7")
     assert points.positions.shape == (2, 3)
+
+
+def test_marks_are_read(table):
+    marks = read_marks(table("point,name,x,y\nA,a.jpg,1,2\nA,b.jpg,3,4\nB,a.jpg,5,6.5\n"))
+    assert marks.labels == ("A", "A", "B")
+    assert marks.names == ("a.jpg", "b.jpg", "a.jpg")
+    np.testing.assert_array_equal(marks.points2D, [[1, 2], [3, 4], [5, 6.5]])
 
 
 @pytest.mark.parametrize(
@@ -75,7 +82,7 @@ def test_distances_and_control_points_are_read(table):
         (read_directions, "name,x,y,z\na,0,0,0\n", "has a length"),
         (read_distances, "name1,name2,distance\na,a,1\n", "between two photos"),
         (read_distances, "name1,name2,distance\na,b,-1\n", "not negative"),
-        (read_control_points, "point,x,y,z\n1.5,1,2,3\n", "whole numbers"),
+        (read_marks, "point,name,x,y\nA,a,1,2\nA,a,1,2\n", "line 3: point is 'A'; it is marked twice in this photo"),
         (read_control_points, "point,x,y,z\n1,1,2,3\n1,1,2,3\n", "lines 2 and 3"),
     ],
 )

@@ -58,6 +58,10 @@ def directions(model, new_from_world):
     return MeasuredDirections(model.image_names, -cams_from_new.rotation.matrix[:, :, 2], unknown(len(model.image_ids)))
 
 
+def labels(model):
+    return tuple(str(point_id) for point_id in model.point_ids)
+
+
 def moved(model, new_from_world):
     return new_from_world @ model.cams_from_world.center
 
@@ -70,7 +74,7 @@ def test_measurements_become_priors_of_the_rows_of_their_names(model):
         positions=MeasuredPositions(names, places, sigmas),
         directions=MeasuredDirections(names, np.eye(3), np.array([2.0, np.nan, 1.0])),
         distances=MeasuredDistances((("a0.jpg", "a2.jpg"), ("b.jpg", "a1.jpg")), np.ones(2), np.array([np.nan, 1.0])),
-        control_points=ControlPoints(np.array([12, 99]), np.array([[1.0, 2.0, np.nan]] * 2), unknown(2, 3)),
+        control_points=ControlPoints(("12", "99"), np.array([[1.0, 2.0, np.nan]] * 2), unknown(2, 3)),
     )
     found = priors_of(model, measured, dataclasses.replace(SURE, position_bias=3.0))
     place, gravity, distance = found.of_poses
@@ -120,7 +124,7 @@ def test_places_on_the_earth_become_east_north_and_up(model):
         ({"positions": MeasuredPositions(("a0.jpg",), np.zeros((1, 3)), unknown(1, 3))}, "--position-sigma"),
         ({"directions": MeasuredDirections(("x",), np.eye(3)[:1], np.ones(1))}, "no direction is of an image"),
         ({"distances": MeasuredDistances((("a0.jpg", "x"),), np.ones(1), np.ones(1))}, "between two images"),
-        ({"control_points": ControlPoints(np.array([1]), np.zeros((1, 3)), np.ones((1, 3)))}, "no control point"),
+        ({"control_points": ControlPoints(("1",), np.zeros((1, 3)), np.ones((1, 3)))}, "no control point"),
     ],
 )
 def test_measurements_of_another_scene_or_without_certainty_are_refused(model, measured, words):
@@ -169,7 +173,7 @@ def test_one_position_moves_the_model(model, rng):
 
 
 def test_control_points_count_like_positions(model, new_from_world, rng):
-    control = ControlPoints(model.point_ids[:4], new_from_world @ model.points3D[:4], unknown(4, 3))
+    control = ControlPoints(labels(model)[:4], new_from_world @ model.points3D[:4], unknown(4, 3))
     found = frame_from_model(model, priors_of(model, Measurements(control_points=control), SURE), rng=rng)
     np.testing.assert_allclose(found.matrix, new_from_world.matrix, atol=1e-9)
 
@@ -198,7 +202,7 @@ def test_deviations_are_counted_in_standard_deviations(model):
     off[0, 0] = 1.0
     measured = Measurements(
         positions=positions(model, centers + off - 0.5),
-        control_points=ControlPoints(model.point_ids, model.points3D, unknown(POINTS, 3)),
+        control_points=ControlPoints(labels(model), model.points3D, unknown(POINTS, 3)),
     )
     priors = priors_of(model, measured, dataclasses.replace(SURE, position_bias=1.0))
     told = deviations(priors, model, np.full((1, 3), 0.5))
