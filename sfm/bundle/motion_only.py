@@ -38,8 +38,8 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason, StopRules, Summary, Trial, minimize
-from sfm.core.optim.linear import solve_positive_definite
 from sfm.core.optim.losses import Loss, evaluate_loss, loss_id
+from sfm.core.optim.solvers import forecast_cheapest, make_solver
 
 _LOST_PX = 100.0
 _FLOOR = 1e-8
@@ -134,6 +134,7 @@ class MotionSystem:
         both = (self._slots[0] >= 0) & (self._slots[1] >= 0)
         self._pattern = BlockPattern.of_pairs(len(self._rows), self._slots[0][both], self._slots[1][both])
         self.held = held_by_parts(problem)[self._rows].ravel()
+        self._solver = make_solver(self._pattern, self.held, forecast_cheapest(self._pattern, self.held))
 
         poses = problem.cams_from_world
         self._now = _Poses(poses.rotation.wxyz.copy(), poses.rotation.matrix, poses.center.copy())
@@ -170,14 +171,10 @@ class MotionSystem:
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves the poses by the solution and evaluates the cost there."""
-        S, side = _dense(self._pattern, self._blocks), -self._gradient
-        diagonal = np.einsum("ii->i", S)
-        diagonal += damping * self._diagonal
-        S[self.held] = 0
-        S[:, self.held] = 0
-        diagonal[self.held] = 1
-        delta = solve_positive_definite(S, side)
-        if delta is None:
+        if not self._solver.factor(self._blocks, damping * self._diagonal, self._threads):
+            return None
+        delta = self._solver.solve(-self._gradient)
+        if not np.all(np.isfinite(delta)):
             return None
         self._trial = self._now.moved(self._rows, delta.reshape(-1, BLOCK))
         cost = self._evaluate(self._trial, False)
@@ -262,11 +259,3 @@ def _numbers(pattern: BlockPattern, rows: np.ndarray, columns: np.ndarray) -> np
     wide = np.int64(pattern.rows)
     keys = np.repeat(np.arange(pattern.rows), np.diff(pattern.offsets)) * wide + pattern.columns
     return np.searchsorted(keys, rows * wide + columns)
-
-
-def _dense(pattern: BlockPattern, blocks: FloatArray) -> FloatArray:
-    """The matrix (6 S, 6 S), of which only the lower triangle is filled."""
-    rows = np.repeat(np.arange(pattern.rows), np.diff(pattern.offsets))
-    S = np.zeros((pattern.rows, BLOCK, pattern.rows, BLOCK))
-    S[rows, :, pattern.columns] = blocks
-    return S.reshape(BLOCK * pattern.rows, -1)
