@@ -6,8 +6,9 @@ product runs through memory in order. Columns are eliminated in panels: the pane
 then what the panel subtracts from the columns to its right. The last two are shared out among threads by rows. The
 sum behind an element of L is always taken in the same order, so that no number depends on the number of threads.
 
-On one thread this takes a third to a half of the time of LAPACK (OpenBLAS) for 120 to 3,000 unknowns, where vectors
-have eight doubles; threads of a BLAS are not used, since those of OpenBLAS stay busy for a while in waiting for more.
+On one thread this takes a third to a half of the time of LAPACK (OpenBLAS) for 120 to 3,000 unknowns where vectors
+have eight doubles, and with four half of it up to as much. Threads of a BLAS are not used: its bits would depend on
+their number, and those of OpenBLAS keep their cores busy for a while in waiting for more.
 
 Reference:
     Gustavson, Recursion leads to automatic variable blocking for dense linear-algebra algorithms, 1997.

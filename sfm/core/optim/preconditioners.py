@@ -3,14 +3,13 @@
     block Jacobi     the blocks on the diagonal of S
     cluster Jacobi   the blocks of pairs within *clusters*, sets of rows that are strongly coupled among themselves:
                      `SparseCholesky` on the pattern that `restricted_pattern` leaves
-    power series     M⁻¹ Σ_k (E M⁻¹)^k for S = M − E, with a few terms of the sum for S⁻¹
 
-The series converges where S = M − E with E positive semidefinite, as of poses and points: M are the blocks of the
-poses before the points are eliminated, E what their elimination subtracts. It may diverge for other M.
+A few terms of the power series of S⁻¹ on top of either halve the steps, but each term costs a product with S, of which
+conjugate gradients make more by themselves: on streets of 1,000 images they took twice the time.
 
 Reference:
     Kushal & Agarwal, Visibility based preconditioning for bundle adjustment, CVPR 2012.
-    Weber, Demmel, Chan & Cremers, Power bundle adjustment for large-scale 3D reconstruction, CVPR 2023.
+    Weber, Demmel, Chan & Cremers, Power bundle adjustment for large-scale 3D reconstruction, CVPR 2023 (the series).
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ import numpy as np
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.optim import _preconditioner_kernels as kernels
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
-from sfm.core.optim.conjugate_gradients import Linear
 
 
 class BlockJacobi:
@@ -70,18 +68,3 @@ def restricted_pattern(pattern: BlockPattern, clusters: np.ndarray) -> tuple[Blo
     counts = np.bincount(rows[within], minlength=pattern.rows)
     offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     return BlockPattern(offsets, pattern.columns[within]), np.flatnonzero(within)
-
-
-def power_series(product: Linear, precondition: Linear, terms: int) -> Linear:
-    """r → the first `terms` + 1 terms of the series for S⁻¹ r, from x → S x and r → M⁻¹ r.
-
-    Each term costs a product, and each is one more step of  z ← z + M⁻¹ (r − S z).
-    """
-
-    def refined(r: FloatArray) -> FloatArray:
-        z = precondition(r)
-        for _ in range(terms):
-            z = z + precondition(r - product(z))
-        return z
-
-    return refined

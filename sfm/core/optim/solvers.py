@@ -53,12 +53,18 @@ class ReducedSolver(Protocol):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Forecast:
-    """What a solver would take for each factorisation; seconds are those of one core of the machine measured."""
+    """What a solver takes for each factorisation, known before any of it is taken.
+
+    Attributes:
+        seconds: on one core of the machine on which they were measured.
+        fronts: of the sparse factor, whose search is part of the forecast.
+    """
 
     kind: SolverKind
     bytes: int
     operations: float
     seconds: float
+    fronts: Fronts | None = dataclasses.field(default=None, repr=False)
 
 
 def forecast_dense(held: BoolArray) -> Forecast:
@@ -69,27 +75,31 @@ def forecast_dense(held: BoolArray) -> Forecast:
     return Forecast("dense", 8 * strips_size(n), operations, seconds)
 
 
-def forecast_sparse(fronts: Fronts) -> Forecast:
-    """What `SparseCholesky` takes for the fronts that `find_fronts` found."""
-    return Forecast("sparse", sparse_bytes(fronts), float(fronts.operations.sum()), float(fronts.seconds.sum()))
+def forecast_sparse(pattern: BlockPattern, held: BoolArray) -> Forecast:
+    """What `SparseCholesky` takes; looks for the order of elimination."""
+    fronts = find_fronts(pattern, held)
+    seconds = float(fronts.seconds.sum())
+    return Forecast("sparse", sparse_bytes(fronts), float(fronts.operations.sum()), seconds, fronts)
 
 
-def choose_solver(
-    pattern: BlockPattern, held: BoolArray, kind: SolverKind | Literal["auto"] = "auto"
-) -> tuple[ReducedSolver, Forecast]:
-    """The solver that is the fastest by the forecast, or the one that is asked for, and its forecast.
+def forecast_cheapest(pattern: BlockPattern, held: BoolArray) -> Forecast:
+    """What the fastest of the solvers takes, the dense one where they are close.
 
     Args:
         held: (6N,) unknowns that stay zero.
     """
     dense = forecast_dense(held)
-    if kind == "dense" or (kind == "auto" and _is_dense(pattern, held)):
-        return DenseCholesky(pattern, held), dense
-    fronts = find_fronts(pattern, held)
-    sparse = forecast_sparse(fronts)
-    if kind == "auto" and sparse.seconds > _WORTH_SPARSE * dense.seconds:
-        return DenseCholesky(pattern, held), dense
-    return SparseCholesky(pattern, held, fronts), sparse
+    if _is_dense(pattern, held):
+        return dense
+    sparse = forecast_sparse(pattern, held)
+    return sparse if sparse.seconds < _WORTH_SPARSE * dense.seconds else dense
+
+
+def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> ReducedSolver:
+    """The solver of a forecast for the same pattern and held unknowns (6N,); takes its memory."""
+    if forecast.kind == "dense":
+        return DenseCholesky(pattern, held)
+    return SparseCholesky(pattern, held, forecast.fronts)
 
 
 def _is_dense(pattern: BlockPattern, held: BoolArray) -> bool:

@@ -10,9 +10,8 @@ import pytest
 from sfm.core.optim import dense_cholesky, sparse_cholesky
 from sfm.core.optim.block_pattern import BlockPattern
 from sfm.core.optim.dense_cholesky import DenseCholesky
-from sfm.core.optim.ordering import find_fronts
 from sfm.core.optim.preconditioners import BlockJacobi
-from sfm.core.optim.solvers import ReducedSolver, choose_solver
+from sfm.core.optim.solvers import ReducedSolver, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
 from sfm.core.optim.sparse_cholesky import SparseCholesky
 
 exact = pytest.mark.parametrize("kind", [DenseCholesky, SparseCholesky], ids=lambda kind: kind.__name__)
@@ -152,31 +151,29 @@ def with_border(pattern):
     ids=["street", "border", "object", "random", "small"],
 )
 def test_the_cheaper_solver_is_chosen(pattern, kind):
-    solver, forecast = choose_solver(pattern, np.zeros(6 * pattern.rows, bool))
-    assert type(solver) is kind
+    held = np.zeros(6 * pattern.rows, bool)
+    forecast = forecast_cheapest(pattern, held)
     assert forecast.kind == ("dense" if kind is DenseCholesky else "sparse")
+    assert type(make_solver(pattern, held, forecast)) is kind
 
 
 @pytest.mark.parametrize("kind", ["dense", "sparse"])
-def test_the_solver_that_is_asked_for_is_taken_and_its_memory_is_forecast(kind, rng):
+def test_memory_is_forecast(kind, rng):
     pattern, held = street(300), rng.random(1800) < 0.05
-    solver, forecast = choose_solver(pattern, held, kind)
-    assert forecast.kind == kind
+    forecast = forecast_dense(held) if kind == "dense" else forecast_sparse(pattern, held)
     tracemalloc.start()
     try:
-        fronts = find_fronts(pattern, held)
-        before = tracemalloc.get_traced_memory()[0]
-        again = DenseCholesky(pattern, held) if kind == "dense" else SparseCholesky(pattern, held, fronts)
-        taken = tracemalloc.get_traced_memory()[0] - before
+        solver = make_solver(pattern, held, forecast)
+        assert solver.factor(np.tile(np.eye(6), (len(pattern.columns), 1, 1)), np.full(1800, 99.0))
+        taken = tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
-    assert type(again) is type(solver)
     assert 0.8 * taken < forecast.bytes < 1.2 * taken
 
 
 def test_a_sparse_factor_of_a_street_takes_a_small_part_of_the_work_of_a_dense_one():
     for pattern in (street(300), with_border(street(300))):
         held = np.zeros(6 * pattern.rows, bool)
-        sparse, dense = choose_solver(pattern, held, "sparse")[1], choose_solver(pattern, held, "dense")[1]
+        sparse, dense = forecast_sparse(pattern, held), forecast_dense(held)
         assert sparse.operations < 0.05 * dense.operations
         assert sparse.bytes < 0.3 * dense.bytes
