@@ -6,7 +6,7 @@ All arrive as a `BundleProblem`, in which poses, points and, if wished, focal le
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,8 @@ ARRAYS = (
     "model_ids", "camera_params", "image_cameras", "points3D", "obs_images", "obs_points", "obs_points2D",
     "free_params", "free_poses", "free_points",
 )  # fmt: skip
+_VERSION = 1
+"""Of what `synthesize` and `street` make: a cached problem of another version is not used."""
 _STREET_VIEWS = 6
 _LATERAL_M, _FAR_M, _NEAR_M = (6.0, 14.0), 45.0, 4.0
 
@@ -136,7 +138,8 @@ def synthesize(images: int, points: int, track_length: int = -1) -> BundleProble
     """pycolmap's: one shared SIMPLE_RADIAL camera, 0.5 px noise, poses and points displaced.
 
     Tracks are of random images; −1 is all that see the point. The matrix of the reduced system is thus nearly full
-    with any number of points, which is the worst case for sparse solvers.
+    with any number of points, which is the worst case for sparse solvers. Meanwhile pycolmap holds the projections of
+    all points into all images: 40 bytes each, 4 GB and two minutes for 2000x50000.
     """
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()
@@ -148,7 +151,9 @@ def synthesize(images: int, points: int, track_length: int = -1) -> BundleProble
     noise.point2D_stddev, noise.point3D_stddev = 0.5, 0.02
     noise.rig_from_world_translation_stddev, noise.rig_from_world_rotation_stddev = 0.02, 0.3
     pycolmap.synthesize_noise(noise, reconstruction)
-    return problem_of(reconstruction)
+    with tempfile.TemporaryDirectory() as folder:  # element by element would take a hundred times longer
+        reconstruction.write_binary(folder)
+        return problem_from_reconstruction(read_model(folder))
 
 
 def street(images: int, points: int, seed: int = 0) -> BundleProblem:
@@ -257,37 +262,6 @@ def _drifted(problem: BundleProblem, anchor: np.ndarray, rng: np.random.Generato
 # --- to and from pycolmap ---
 
 
-def problem_of(reconstruction: pycolmap.Reconstruction) -> BundleProblem:
-    """The same numbers for our side; images, cameras and points in the order of their ids."""
-    cameras, images = sorted(reconstruction.cameras), sorted(reconstruction.reg_image_ids())
-    params, free = np.zeros((len(cameras), 12)), np.zeros((len(cameras), 12), bool)
-    for row, camera_id in enumerate(cameras):
-        camera = reconstruction.cameras[camera_id]
-        params[row, : len(camera.params)] = camera.params
-        free[row, [*camera.focal_length_idxs(), *camera.extra_params_idxs()]] = True
-    keypoints = {k: np.array([p.xy for p in reconstruction.images[k].points2D]) for k in images}
-    row_of = {k: row for row, k in enumerate(images)}
-    points3D, columns = [], []
-    for row, k in enumerate(sorted(reconstruction.points3D)):
-        point = reconstruction.points3D[k]
-        points3D.append(point.xyz)
-        columns += [(row_of[e.image_id], row, *keypoints[e.image_id][e.point2D_idx]) for e in point.track.elements]
-    table = np.array(columns)
-    return BundleProblem(
-        model_ids=np.array([int(reconstruction.cameras[k].model) for k in cameras], np.int32),
-        camera_params=params,
-        image_cameras=np.searchsorted(cameras, [reconstruction.images[k].camera_id for k in images]).astype(np.int32),
-        cams_from_world=_poses_of(reconstruction, images),
-        points3D=np.array(points3D),
-        obs_images=table[:, 0].astype(np.int32),
-        obs_points=table[:, 1].astype(np.int32),
-        obs_points2D=np.ascontiguousarray(table[:, 2:]),
-        free_params=free,
-        free_poses=np.ones(len(images), bool),
-        free_points=np.ones(len(points3D), bool),
-    )
-
-
 def reconstruction_of(problem: BundleProblem) -> pycolmap.Reconstruction:
     """The same numbers for Ceres; the ids of images, cameras and points are their rows plus one."""
     reconstruction = pycolmap.Reconstruction()
@@ -358,7 +332,7 @@ def load(path: Path) -> BundleProblem:
 
 def remembered(kind: str, size: str, cache: Path | None) -> BundleProblem:
     """The synthetic problem `kind` of a size like 100x20000x10, made or taken from the folder `cache`."""
-    path = None if cache is None else cache / f"{kind}-{size}-{_version()}.npz"
+    path = None if cache is None else cache / f"{kind}-{size}-v{_VERSION}.npz"
     if path is not None and path.is_file():
         return load(path)
     problem = (street if kind == "street" else synthesize)(*map(int, size.split("x")))
@@ -366,11 +340,6 @@ def remembered(kind: str, size: str, cache: Path | None) -> BundleProblem:
         path.parent.mkdir(parents=True, exist_ok=True)
         save(problem, path)
     return problem
-
-
-def _version() -> str:
-    """Changes with this file, so that a cached problem is never an old one."""
-    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:8]
 
 
 def start_error_px(problem: BundleProblem) -> float:

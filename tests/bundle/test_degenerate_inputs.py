@@ -202,8 +202,7 @@ def test_adjustment_ends_with_numbers(name, gauge, free_params, rng):
     try:
         start = case(name, rng, free_params)
         result = adjust(start, BundleConfig(gauge=gauge, max_iterations=30))
-    except ValueError as error:
-        assert str(error)
+    except ValueError:
         return
     assert_nothing_got_lost(start, result.problem)
     assert np.isfinite([result.initial_cost, result.final_cost]).all()
@@ -229,8 +228,7 @@ def test_a_covariance_is_one_or_is_refused_by_name(name, gauge, free_params, rng
     try:
         problem = case(name, rng, free_params)
         found = covariance(problem, BundleConfig(gauge=gauge))
-    except ValueError as error:
-        assert str(error)
+    except ValueError:
         return
     if isinstance(found, Rejected):
         assert found.reason.startswith("undetermined_")
