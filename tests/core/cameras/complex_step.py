@@ -39,13 +39,13 @@ def project(model: str, params: np.ndarray, points3D: np.ndarray) -> np.ndarray:
 def by_point(model: str, params: np.ndarray, points3D: np.ndarray) -> np.ndarray:
     """(N, 2, 3)."""
     steps = 1j * STEP * np.eye(3)
-    return np.stack([project(model, params, points3D + step).imag / STEP for step in steps], axis=2)
+    return np.stack([np.imag(project(model, params, points3D + step)) / STEP for step in steps], axis=2)
 
 
 def by_params(model: str, params: np.ndarray, points3D: np.ndarray) -> np.ndarray:
     """(N, 2, number of parameters)."""
     steps = 1j * STEP * np.eye(len(params))
-    return np.stack([project(model, params + step, points3D).imag / STEP for step in steps], axis=2)
+    return np.stack([np.imag(project(model, params + step, points3D)) / STEP for step in steps], axis=2)
 
 
 def _angle(opposite: np.ndarray, adjacent: np.ndarray) -> np.ndarray:
