@@ -112,7 +112,7 @@ def test_squared_errors_are_those_of_the_formulas(problem):
     np.testing.assert_allclose(squared_errors(problem), np.sum(r**2, axis=1), rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("loss", ["trivial", "huber", "cauchy"])
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
 def test_the_gradient_of_each_camera_parameter_is_that_of_complex_steps(problem, loss):
     residuals = weighted_residuals(problem, loss)
     for k in range(length(problem)):
@@ -121,7 +121,7 @@ def test_the_gradient_of_each_camera_parameter_is_that_of_complex_steps(problem,
         assert gradient_max(with_free(problem, params=[(1, k)]), loss) == pytest.approx(expected, abs=1e-9 * size)
 
 
-@pytest.mark.parametrize("loss", ["trivial", "huber", "cauchy"])
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
 def test_the_gradient_of_each_point_is_that_of_complex_steps(problem, loss):
     residuals, R = weighted_residuals(problem, loss), problem.cams_from_world.rotation.matrix[problem.obs_images]
     terms = np.stack([np.sum(residuals * by_motion(problem, R[:, :, k]), axis=1) for k in range(3)], axis=1)
