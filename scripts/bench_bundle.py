@@ -1,7 +1,7 @@
 """Our bundle adjustment against Ceres, which pycolmap runs on the same problem in the same process.
 
-    scripts/bench_bundle.py [PROBLEM ...] [--synthetic 20x5000 100x20000x10 500x50000x10 2000x100000x10]
-                            [--street 10000x1000000] [--intrinsics free fixed] [--curve] [--plot FILE] [--json]
+    python -m scripts.bench_bundle [PROBLEM ...] [--synthetic 20x5000 100x20000x10 500x50000x10 2000x50000x10]
+                                   [--street 10000x1000000] [--intrinsics free fixed] [--curve] [--plot FILE] [--json]
 
 A PROBLEM is a file of Bundle Adjustment in the Large, of GBP (fr1desk…) or of sba (7pts.txt, with 7cams.txt and
 calib.txt beside it), or the folder of a COLMAP model, e.g. SCENE/sparse/0 of an `sfm run`; --disturb moves the poses
@@ -19,10 +19,11 @@ stops at a step of 1e-14 of the parameters. The linear solver of Ceres is the on
 residuals COLMAP gives Ceres one thread, which is faster there.
 
 Times are those of the one call a user makes, after one untimed step that compiles our kernels; Ceres' call is setting
-up its problem and solving it. Ratios are medians over the repeats, the sides taking turns. Ceres' final cost is
-computed by our code. Peak memory is what a call adds to a process of its own. A row is as it should be (cost, time,
-memory: yes) if our cost is at most theirs × (1 + 1e-6), our time at most 1/6 of theirs (1/3 with more than 500 images)
-and our memory not more.
+up its problem and solving it. Ratios are medians over the repeats, the sides taking turns. Final costs are computed by
+our code; they are compared (rel.) over the observations that still have a projection at the end of both, since Ceres
+charges nothing for a point behind a camera. Peak memory is what a call adds to a process of its own. A row is as it
+should be (cost, time, memory: yes) if our cost is at most theirs × (1 + 1e-6), our time at most 1/6 of theirs (1/3 with
+more than 500 images) and our memory not more.
 
 Of ../shared/data/ba, libmv's problem and gtsam's are left out: the one refines poses by a distortion model of its own,
 the others have fewer equations than unknowns. The landmarks of fr1desk start on a plane (240 px), with several minima;
@@ -39,12 +40,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-import bench_bundle_problems as problems
-from bench_bundle_curves import Curve, curve_table, draw
-from bench_bundle_race import LOSSES, SOLVERS, Outcome, Rules, curves, peak_memory_mb, race, run_side, warm_up
-
+from scripts import bench_bundle_problems as problems
+from scripts.bench_bundle_curves import Curve, curve_table, draw
+from scripts.bench_bundle_race import LOSSES, SOLVERS, Outcome, Rules, curves, peak_memory_mb, race, run_side, warm_up
 from sfm.bundle import BundleProblem
 
 _COST_SLACK = 1e-6

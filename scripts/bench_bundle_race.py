@@ -19,10 +19,17 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from bench_bundle_curves import Curve
-from bench_bundle_problems import load, reconstruction_of, save, synthesize, with_fixed_intrinsics, with_parameters_of
 from pycolmap import pyceres
 
+from scripts.bench_bundle_curves import Curve
+from scripts.bench_bundle_problems import (
+    load,
+    reconstruction_of,
+    save,
+    synthesize,
+    with_fixed_intrinsics,
+    with_parameters_of,
+)
 from sfm.bundle import BundleConfig, BundleProblem, adjust, squared_errors
 from sfm.core.optim import evaluate_loss
 
@@ -240,11 +247,18 @@ def _captured_stdout() -> Iterator[list[str]]:
 def peak_memory_mb(problem: BundleProblem, rules: Rules, side: str) -> float:
     """What one call of `side` adds at its peak to the resident memory of a process that holds the problem."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "problem.npz"
+        path, root = Path(folder) / "problem.npz", Path(__file__).resolve().parent.parent
         save(problem, path)
-        bench = Path(__file__).with_name("bench_bundle.py")
-        command = [sys.executable, str(bench), "--run-side", side, str(path), json.dumps(dataclasses.asdict(rules))]
-        return float(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+        command = [
+            sys.executable,
+            "-m",
+            "scripts.bench_bundle",
+            "--run-side",
+            side,
+            str(path),
+            json.dumps(dataclasses.asdict(rules)),
+        ]
+        return float(subprocess.run(command, check=True, cwd=root, stdout=subprocess.PIPE, text=True).stdout)
 
 
 def run_side(words: Sequence[str]) -> None:
