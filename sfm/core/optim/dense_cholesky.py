@@ -16,6 +16,8 @@ Reference:
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from sfm.core.arrays import BoolArray, FloatArray
@@ -25,7 +27,8 @@ from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
 STRIP = 8
 """Rows of a strip."""
-_SHARE_FROM = 150
+Count = TypeVar("Count", int, np.ndarray)
+SHARE_FROM = 100
 """Strips from which threads pay; handing out the work of a panel takes a third of a millisecond."""
 
 
@@ -57,7 +60,7 @@ class DenseCholesky:
         def scatter(rows: tuple[int, int]) -> None:
             kernels.scatter_blocks(*rows, blocks, pattern.offsets, pattern.columns, self._position, damping, L)
 
-        share = threads if strip_count(n) >= _SHARE_FROM else 1
+        share = threads if strip_count(n) >= SHARE_FROM else 1
         list(ordered_map(scatter, chunk_bounds(pattern.rows, share), threads=share))
         return factor_strips(L, strip_count(n), threads)
 
@@ -68,8 +71,8 @@ class DenseCholesky:
         return x
 
 
-def strip_count(unknowns: int) -> int:
-    """Strips that hold so many rows."""
+def strip_count(unknowns: Count) -> Count:
+    """Strips that hold so many rows; for each number of an array too."""
     return -(-unknowns // STRIP)
 
 
@@ -98,7 +101,7 @@ def eliminate_panel(
         L: has the factor of the front at `at`; `pivots` of its `end` strips are eliminated in the end.
         rest: has the Schur complement of the others at `rest_at`.
     """
-    threads = threads if end - last >= _SHARE_FROM else 1
+    threads = threads if end - last >= SHARE_FROM else 1
 
     def below(rows: tuple[int, int]) -> None:
         kernels.factor_panel(L, at, pivots, first, last, *rows)

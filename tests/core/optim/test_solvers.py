@@ -83,7 +83,8 @@ def test_what_is_not_positive_definite_or_not_finite_has_no_factor(kind, rng):
 
 @exact
 def test_the_bits_do_not_depend_on_the_number_of_threads(kind, rng, monkeypatch):
-    monkeypatch.setattr(dense_cholesky, "_SHARE_FROM", 5)
+    monkeypatch.setattr(dense_cholesky, "SHARE_FROM", 5)
+    monkeypatch.setattr(sparse_cholesky, "SHARE_FROM", 5)
     monkeypatch.setattr(sparse_cholesky, "_WORTH_SHARING_S", 0.0)
     for pattern, S in (random_system(rng, 100, 800), random_system(rng, 150, 250)):
         n = 6 * pattern.rows
