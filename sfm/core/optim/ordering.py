@@ -8,6 +8,9 @@ Consecutive rows with nearly the same columns are eliminated together, as a *fro
 are eliminated, its pivots, and the rows below that these are coupled to, the rest. Joining a front with the one that
 takes in its rest adds zeros to the factor, and is done where larger tiles gain more time than the zeros cost.
 
+On graphs of images along streets and on a plain, the order takes a tenth more operations than the exact minimum
+degree of SuperLU at worst; nested dissection by distance from an end took 1.5 to 6 times as many.
+
 Reference:
     Amestoy, Davis & Duff, An approximate minimum degree ordering algorithm, 1996 (without supervariables).
     Liu, The role of elimination trees in sparse factorization, 1990.
