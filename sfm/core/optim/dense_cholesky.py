@@ -24,6 +24,7 @@ from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import chunk_bounds, ordered_map
 from sfm.core.optim import _cholesky_kernels as kernels
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
 
 STRIP = 8
 """Rows of a strip."""
@@ -69,6 +70,13 @@ class DenseCholesky:
         x = np.zeros(len(side))
         x[self._free] = solve_strips(self._L, side[self._free])
         return x
+
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
+        Z = front_inverse(self._L, strip_count(len(self._free)), np.zeros((0, 0)))
+        row = np.repeat(np.arange(self._pattern.rows), np.diff(self._pattern.offsets))
+        position = self._position.reshape(-1, BLOCK)
+        return gathered_blocks(Z, position[row], position[self._pattern.columns])
 
 
 def strip_count(unknowns: Count) -> Count:

@@ -95,7 +95,7 @@ def forecast_cheapest(pattern: BlockPattern, held: BoolArray) -> Forecast:
     return sparse if sparse.seconds < _WORTH_SPARSE * dense.seconds else dense
 
 
-def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> ReducedSolver:
+def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> DenseCholesky | SparseCholesky:
     """The solver of a forecast for the same pattern and held unknowns (6N,); takes its memory."""
     if forecast.kind == "dense":
         return DenseCholesky(pattern, held)

@@ -27,6 +27,7 @@ from sfm.core.optim._cholesky_kernels import PANEL, factor_panel
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.dense_cholesky import SHARE_FROM, STRIP, eliminate_panel, strip_count
 from sfm.core.optim.ordering import Fronts, find_fronts
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
 
 _JOBS = 8
 """Subtrees of about this part of the work; more would leave more fronts above them, which are done one by one."""
@@ -83,7 +84,7 @@ class SparseCholesky:
     def __init__(self, pattern: BlockPattern, held: BoolArray, fronts: Fronts | None = None) -> None:
         fronts = find_fronts(pattern, held) if fronts is None else fronts
         schedule = _schedule(fronts)
-        self._free = _free_in_order(fronts, held)
+        self._free, self._blocks = _free_in_order(fronts, held), len(pattern.columns)
         self._plan = _plan(pattern, held, fronts, schedule.rest_at)
         self._jobs, self._top = schedule.jobs, schedule.top
         self._shared = fronts.seconds.sum() >= _WORTH_SHARING_S
@@ -130,6 +131,29 @@ class SparseCholesky:
         x = np.zeros(len(side))
         x[self._free] = z
         return x
+
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
+        plan, blocks = self._plan, np.zeros((self._blocks, BLOCK, BLOCK))
+        below = {f: np.zeros((0, 0)) for f in np.flatnonzero(plan.rests == 0).tolist()}
+        for f in range(len(plan.pivots) - 1, -1, -1):
+            L = self._L[plan.factor_at[f] : plan.factor_at[f + 1]]
+            Z = front_inverse(L, strip_count(int(plan.pivots[f])), below.pop(f))
+            for child in plan.child[plan.children[f] : plan.children[f + 1]].tolist():
+                place = plan.place[plan.rest_starts[child] : plan.rest_starts[child + 1]]
+                below[child] = np.pad(Z[np.ix_(place, place)], (0, -len(place) % STRIP))
+            own = slice(plan.entries[f], plan.entries[f + 1])
+            blocks[plan.entry_block[own]] = _own_blocks(plan, own, Z)
+        return blocks
+
+
+def _own_blocks(plan: Plan, own: slice, Z: FloatArray) -> FloatArray:
+    """The blocks of a front's own entries of S in the inverse Z of the front."""
+    high, low, rank = plan.entry_high[own], plan.entry_low[own], plan.rank.reshape(-1, BLOCK)
+    rows = np.where(rank[high] >= 0, rank[high] + plan.entry_high_at[own, None], -1)
+    columns = np.where(rank[low] >= 0, rank[low] + plan.entry_low_at[own, None], -1)
+    blocks = gathered_blocks(Z, rows, columns)
+    return np.where((high < low)[:, None, None], blocks.transpose(0, 2, 1), blocks)
 
 
 def sparse_bytes(fronts: Fronts) -> int:

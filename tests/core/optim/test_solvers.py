@@ -109,6 +109,23 @@ def test_badly_scaled_systems_are_solved_to_a_small_residual(kind, rng):
     np.testing.assert_allclose((S @ solver.solve(side) - side) / scale, 0, atol=1e-9 * np.abs(side / scale).max())
 
 
+@exact
+@pytest.mark.parametrize("held_part", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("rows", "pairs"), [(0, 0), (1, 0), (9, 12), (40, 60), (60, 3000)])
+def test_blocks_of_the_inverse_equal_numpys(kind, rng, rows, pairs, held_part):
+    pattern, S = random_system(rng, rows, pairs)
+    held, damping = rng.random(6 * rows) < held_part, rng.random(6 * rows)
+    held[6:12] |= held_part > 0
+    solver = kind(pattern, held)
+    assert solver.factor(lower_blocks(S, pattern), damping, 1)
+    inverse = np.zeros_like(S)
+    free = np.flatnonzero(~held)
+    inverse[np.ix_(free, free)] = np.linalg.inv((S + np.diag(damping))[np.ix_(free, free)])
+    i = np.repeat(np.arange(rows), np.diff(pattern.offsets))
+    expected = inverse.reshape(rows, 6, rows, 6)[i, :, pattern.columns]
+    np.testing.assert_allclose(solver.inverse_blocks(), expected, rtol=0, atol=1e-12)
+
+
 def test_rows_on_their_own_are_solved_by_all_alike(rng):
     pattern, S = random_system(rng, 30, 0)
     held, damping, side = rng.random(180) < 0.3, rng.random(180), rng.normal(size=180)
