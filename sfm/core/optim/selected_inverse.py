@@ -6,7 +6,8 @@ the front of the parent has,
     Y = L₂₁ L₁₁⁻¹        Z₂₁ = −Z₂₂ Y        Z₁₁ = L₁₁⁻ᵀ L₁₁⁻¹ − Yᵀ Z₂₁
 
 so that the inverse goes down the tree, and ends with every block that L has, those of S among them. A dense factor is
-a front without rows below.
+a front without rows below. The products are those of NumPy: unlike the factor's, their last bits may depend on the
+number of cores that its BLAS uses.
 
 Reference:
     Takahashi, Fagan & Chin, Formation of a sparse bus impedance matrix, 1973.
