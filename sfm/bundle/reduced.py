@@ -103,6 +103,7 @@ class ReducedSystem:
         self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
+        self._narrow = not np.any(layout.shared.columns[:, 3:] >= 0)
         self._ranges = layout.row_ranges(max(threads, 1))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
         self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
@@ -158,7 +159,7 @@ class ReducedSystem:
     def _eliminate_rows(self, rows: tuple[int, int]) -> None:
         pattern = self.plan.pattern
         eliminate(
-            *rows, *self._couplings, *self._points, self._gradient_of_points,
+            *rows, self._narrow, *self._couplings, *self._points, self._gradient_of_points,
             pattern.offsets, pattern.columns, self._blocks, self._side, self._diagonal,
         )  # fmt: skip
 

@@ -1,6 +1,7 @@
 """Products of tiny matrices in vector registers, for the inner loops of the elimination.
 
     subtract_product(C, factors, B)    C −= A B       6×8, 6×3, 3×8
+    subtract_upper(C, factors, B)      the same for the first three rows
     set_product(C, factors, B)         C  = M B       3×8, 3×3 symmetric, 3×8
     add_combination(c, factors, B)     c += fᵀ B      8, 3, 3×8
 
@@ -30,6 +31,11 @@ WIDTH = 8
 def subtract_product(C, factors, B):
     """C −= A B for C (6, 8), the 18 `factors` of A (6, 3), B (3, 8)."""
     C -= np.array(factors).reshape(6, 3) @ B
+
+
+def subtract_upper(C, factors, B):
+    """C −= A B for the first three rows of C (6, 8) and the first nine of the 18 `factors`, B (3, 8)."""
+    C[:3] -= np.array(factors[:9]).reshape(3, 3) @ B
 
 
 def set_product(C, factors, B):
@@ -93,6 +99,7 @@ def _intrinsic(rows, numbers, sign):
 
 
 _subtract_product = _intrinsic(6, [(3 * r, 3 * r + 1, 3 * r + 2) for r in range(6)], -1)
+_subtract_upper = _intrinsic(3, [(3 * r, 3 * r + 1, 3 * r + 2) for r in range(3)], -1)
 _set_product = _intrinsic(3, [(0, 1, 2), (1, 3, 4), (2, 4, 5)], None)
 _add_combination = _intrinsic(1, [(0, 1, 2)], 1)
 
@@ -105,6 +112,13 @@ def _is_contiguous(*arrays):
 def _compiled_subtract_product(C, factors, B):
     if _is_contiguous(C, B):
         return lambda C, factors, B: _subtract_product(C, factors, B)  # pyright: ignore[reportCallIssue]
+    return None
+
+
+@overload(subtract_upper)
+def _compiled_subtract_upper(C, factors, B):
+    if _is_contiguous(C, B):
+        return lambda C, factors, B: _subtract_upper(C, factors, B)  # pyright: ignore[reportCallIssue]
     return None
 
 

@@ -10,7 +10,7 @@ import math
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import WIDTH, add_combination, set_product, subtract_product
+from sfm.core.optim._block_kernels import WIDTH, add_combination, set_product, subtract_product, subtract_upper
 
 _RELATIVE_FLOOR = 1e-8
 _PIVOT_FLOOR = 1e-15
@@ -69,7 +69,7 @@ def _by_columns(y):
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def eliminate(
-    first_row, last_row, starts, slot, N, shared_starts, shared_slot, B, centers, X, M, g, offsets, columns,
+    first_row, last_row, narrow, starts, slot, N, shared_starts, shared_slot, B, centers, X, M, g, offsets, columns,
     blocks, side, diagonal,
 ):  # fmt: skip
     """Adds the poses' own blocks to the rows `first_row:last_row` of S and takes off what goes with the points.
@@ -77,6 +77,7 @@ def eliminate(
     Blocks that the pattern lacks are left out. `diagonal` (rows, 6) gets what the poses' own blocks have there.
 
     Args:
+        narrow: whether no shared row has more than three unknowns.
         starts, slot, N: by point (P + 1,), the row of each coupling with a pose (E,), ascending, and its (E, 6).
         shared_starts, shared_slot, B: the same for shared rows, which lie behind those of poses; (G, 3, 6).
         centers: (S, 3) of the poses by row; X: (P, 3).
@@ -134,7 +135,10 @@ def eliminate(
                     while columns[ahead] > wanted:
                         ahead -= 1
                     if columns[ahead] == wanted:
-                        subtract_product(blocks[ahead], factors, W[j])
+                        if narrow and k >= poses:
+                            subtract_upper(blocks[ahead], factors, W[j])
+                        else:
+                            subtract_product(blocks[ahead], factors, W[j])
                         at = ahead
             if k < poses:
                 u0, u1, u2 = X[p, 0] - centers[i, 0], X[p, 1] - centers[i, 1], X[p, 2] - centers[i, 2]

@@ -3,12 +3,13 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import add_combination, set_product, subtract_product
+from sfm.core.optim._block_kernels import add_combination, set_product, subtract_product, subtract_upper
 
 
 @nb.njit
 def compiled(C, a, B, D, m, c, f):
     subtract_product(C[1], a, B)
+    subtract_upper(C[2], a, B)
     set_product(D, m, B)
     add_combination(c, f, B)
 
@@ -18,6 +19,7 @@ def test_the_compiled_products_equal_the_plain_ones_and_touch_nothing_else(rng):
     a, m, f = (tuple(rng.normal(size=size)) for size in (18, 6, 3))
     compiled(got_C := C.copy(), a, B, got_D := D.copy(), m, got_c := c.copy(), f)
     subtract_product(C[1], a, B)
+    subtract_upper(C[2], a, B)
     set_product(D, m, B)
     add_combination(c, f, B)
     np.testing.assert_allclose(got_C, C, rtol=0, atol=1e-14)
@@ -33,5 +35,7 @@ def test_the_plain_products_are_those_of_matrices(rng):
     set_product(D, tuple(m[np.triu_indices(3)]), B)
     add_combination(c, tuple(f), B)
     np.testing.assert_allclose(C, 1 - a @ B, atol=1e-14)
+    subtract_upper(C, tuple(a.ravel()), B)
+    np.testing.assert_allclose(C, 1 - np.r_[2 * a[:3], a[3:]] @ B, atol=1e-14)
     np.testing.assert_allclose(D, m @ B, atol=1e-14)
     np.testing.assert_allclose(c, 1 + f @ B, atol=1e-14)

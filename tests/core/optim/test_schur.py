@@ -67,12 +67,12 @@ class Problem:
     def couplings(self):
         return schur.Couplings(self.starts, self.slot, self.N, self.shared_starts, self.shared_slot, self.B)
 
-    def eliminate(self, pattern, ranges):
+    def eliminate(self, pattern, ranges, narrow=False):
         blocks, side = np.zeros((len(pattern.columns), 6, 8)), np.zeros((self.rows, 8))
         diagonal = np.zeros((self.rows, 6))
         for first, last in ranges:
             schur.eliminate(
-                first, last, *self.couplings, self.centers, self.X, self.M, self.g, pattern.offsets, pattern.columns,
+                first, last, narrow, *self.couplings, self.centers, self.X, self.M, self.g, pattern.offsets, pattern.columns,
                 blocks, side, diagonal,
             )  # fmt: skip
         return blocks[:, :, :6], side[:, :6], diagonal
@@ -112,6 +112,13 @@ def test_elimination_equals_the_dense_schur_complement(rng, ranges):
     np.testing.assert_allclose(assembled(pattern, blocks), np.tril(S), atol=1e-10)
     np.testing.assert_allclose(side.ravel(), expected, atol=1e-10)
     np.testing.assert_allclose(diagonal.ravel(), np.diag(U), atol=1e-10)
+
+
+def test_narrow_shared_rows_give_the_same_blocks(rng):
+    problem, pattern = Problem(rng), BlockPattern.full(7)
+    problem.B[:, :, 3:] = 0
+    for wide, narrow in zip(*(problem.eliminate(pattern, [(0, 7)], flag) for flag in (False, True)), strict=True):
+        np.testing.assert_array_equal(wide, narrow)
 
 
 def test_a_pattern_with_fewer_blocks_gets_those_it_has(rng):
