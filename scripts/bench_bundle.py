@@ -1,230 +1,214 @@
 """Our bundle adjustment against Ceres, which pycolmap runs on the same problem in the same process.
 
-    scripts/bench_bundle.py [BAL_FILE ...] [--synthetic 20x5000 100x20000x10 ...] [--repeats 3] [--threads 2] [--json]
+    python -m scripts.bench_bundle [PROBLEM ...] [--synthetic 20x5000 100x20000x10 500x50000x10 2000x50000x10]
+                                   [--street 10000x1000000] [--intrinsics free fixed] [--curve] [--plot FILE] [--json]
 
-A synthetic size is IMAGESxPOINTS or IMAGESxPOINTSxTRACK_LENGTH. Both sides start from the same numbers, free the same
-parameters (poses, points, focal lengths and distortion; only poses and points with --fix-intrinsics), minimise the
-same loss and stop at the same relative decrease of the cost. Ceres' final cost is computed by our code. The time of
-each side is that of the one call a user makes; ratios are medians over the repeats, the sides taking turns.
+A PROBLEM is a file of Bundle Adjustment in the Large, of GBP (fr1desk…) or of sba (7pts.txt, with 7cams.txt and
+calib.txt beside it), or the folder of a COLMAP model, e.g. SCENE/sparse/0 of an `sfm run`; --disturb moves the poses
+and points of models before the race, since the start is a solution. A synthetic size is IMAGESxPOINTS or
+IMAGESxPOINTSxTRACK_LENGTH; a street runs on our side only, unless --ceres-too.
+
+Both sides start from the same numbers, free the same parameters (poses, points, focal lengths and distortion; with
+--intrinsics fixed only poses and points), hold the same seven freedoms (the pose of one image and one direction of a
+second), minimise the same loss on the same number of threads, and stop by the same rules: a step that lowers the cost
+by less than --tolerance of it (Ceres: function_tolerance; ours asks in addition that the step was little damped and
+had promised no more), no entry of the gradient above --gradient-tolerance, or --max-iterations trials. COLMAP's
+own defaults are 0 (off), 1e-4 and 100. Ceres stops by parameter_tolerance, too, which COLMAP leaves at 0 (off); ours
+stops at a step of 1e-14 of the parameters. The linear solver of Ceres is the one that COLMAP picks (dense Schur up to
+50 images, sparse up to 1,000, then iterative with Schur–Jacobi), unless --ceres-solver says otherwise; below 50,000
+residuals COLMAP gives Ceres one thread, which is faster there.
+
+Times are those of the one call a user makes, after one untimed step that compiles our kernels; Ceres' call is setting
+up its problem and solving it. Ratios are medians over the repeats, the sides taking turns. Final costs are computed by
+our code; they are compared (rel.) over the observations that still have a projection at the end of both, since Ceres
+charges nothing for a point behind a camera. Peak memory is what a call adds to a process of its own. A row is as it
+should be (cost, time, memory: yes) if our cost is at most theirs × (1 + 1e-6), our time at most 1/6 of theirs (1/3 with
+more than 500 images) and our memory not more.
+
+Of ../shared/data/ba, libmv's problem and gtsam's are left out: the one refines poses by a distortion model of its own,
+the others have fewer equations than unknowns. The landmarks of fr1desk start on a plane (240 px), with several minima;
+race it with --loss cauchy.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
-import statistics
 import sys
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-import pycolmap
+from scripts import bench_bundle_problems as problems
+from scripts.bench_bundle_curves import Curve, curve_table, draw
+from scripts.bench_bundle_race import LOSSES, SOLVERS, Outcome, Rules, curves, peak_memory_mb, race, run_side, warm_up
+from sfm.bundle import BundleProblem
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-
-from sfm.bundle import BundleConfig, BundleProblem, BundleResult, adjust
-from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3
-
-LOSSES = {
-    "trivial": pycolmap.LossFunctionType.TRIVIAL,
-    "soft_l1": pycolmap.LossFunctionType.SOFT_L1,
-    "cauchy": pycolmap.LossFunctionType.CAUCHY,
-}
+_COST_SLACK = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Row:
-    """One problem, both sides."""
+    """One problem, both sides. Memory in MB; what was not measured is None."""
 
     name: str
+    intrinsics: str
     images: int
     points: int
     observations: int
-    invalid: int
-    initial_cost: float
-    our_cost: float
-    their_cost: float
-    our_iterations: int
-    our_reason: str
-    our_seconds: float
-    their_seconds: float
-    ratio: float
+    start_px: float
+    outcome: Outcome
+    our_memory_mb: float | None
+    ceres_memory_mb: float | None
+    curve: dict[str, Curve] | None = None
+
+    @property
+    def wanted_ratio(self) -> float:
+        """How many times faster than Ceres we ought to be."""
+        return 6.0 if self.images <= 500 else 3.0
+
+    @property
+    def holds(self) -> dict[str, bool | None]:
+        """Whether cost, time and memory are as they should be; None where it was not measured."""
+        cost = None if self.outcome.difference is None else self.outcome.difference <= _COST_SLACK
+        time = None if self.outcome.ratio is None else self.outcome.ratio >= self.wanted_ratio
+        both = self.our_memory_mb is not None and self.ceres_memory_mb is not None
+        return {"cost": cost, "time": time, "memory": self.our_memory_mb <= self.ceres_memory_mb if both else None}  # type: ignore[operator]
 
     def __str__(self) -> str:
+        ours, ceres, outcome = self.outcome.ours, self.outcome.ceres, self.outcome
+        difference = "-" if outcome.difference is None else f"{outcome.difference:+.1e}"
+        theirs = "-" if ceres is None else f"{ceres.seconds:.3f}"
+        ratio = "-" if outcome.ratio is None else f"{outcome.ratio:.2f}"
+        steps = f"{ours.iterations}" + ("" if ceres is None else f"/{ceres.iterations}")
+        memory = "/".join("-" if m is None else f"{m:.0f}" for m in (self.our_memory_mb, self.ceres_memory_mb))
+        holds = " ".join(f"{ {True: 'yes', False: 'NO', None: '-'}[value]:>4}" for value in self.holds.values())
         return (
-            f"{self.name:28} {self.images:5} {self.points:7} {self.observations:8}  {self.our_cost:14.6e} "
-            f"{self.our_cost / self.their_cost - 1:+9.1e}  {self.our_seconds:8.3f} s {self.their_seconds:8.3f} s "
-            f"{self.ratio:6.2f}x  ({self.our_iterations} steps, {self.our_reason}, {self.invalid} invalid)"
+            f"{self.name:30.30} {self.intrinsics:5} {self.images:5} {self.points:7} {self.observations:8} "
+            f"{self.start_px:8.2f} {ours.cost:14.7e} {difference:>8} {ours.seconds:8.3f} {theirs:>8} "
+            f"{ratio:>6} {steps:>7} {memory:>11} {holds}  {self._endings()}"
         )
 
+    def _endings(self) -> str:
+        sides = [side for side in (self.outcome.ours, self.outcome.ceres) if side is not None]
+        lost = [f" ({side.without_projection} without projection)" * (side.without_projection > 0) for side in sides]
+        return " | ".join(side.reason + words for side, words in zip(sides, lost, strict=True))
 
-def read_bal(path: Path) -> pycolmap.Reconstruction:
-    """A problem of Bundle Adjustment in the Large, whose cameras look along −z with y up, as RADIAL cameras."""
-    numbers = np.array(path.read_text().split(), float)
-    images, _, observations = numbers[:3].astype(int)
-    table = numbers[3 : 3 + 4 * observations].reshape(-1, 4)
-    rest = numbers[3 + 4 * observations :]
-    cameras, points3D = rest[: 9 * images].reshape(-1, 9), rest[9 * images :].reshape(-1, 3)
-    flip = Rotation3(np.array([0.0, 1.0, 0.0, 0.0]))
-    reconstruction = pycolmap.Reconstruction()
-    features = [np.flatnonzero(table[:, 0] == k) for k in range(images)]
-    position = np.empty(observations, int)
-    for k, (rows, (rx, ry, rz, tx, ty, tz, f, k1, k2)) in enumerate(zip(features, cameras, strict=True)):
-        position[rows] = np.arange(len(rows))
-        pose = Rigid3(flip @ Rotation3.exp(np.array([rx, ry, rz])), flip @ np.array([tx, ty, tz]))
-        reconstruction.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="RADIAL", width=2000, height=2000, params=[f, 0, 0, k1, k2], camera_id=k + 1)
-        )
-        keypoints = table[rows, 2:] * [1.0, -1.0]
-        reconstruction.add_image_with_trivial_frame(
-            pycolmap.Image(name=f"{k}.jpg", points2D=pycolmap.Point2DList(list(map(pycolmap.Point2D, keypoints))),
-                           camera_id=k + 1, image_id=k + 1),
-            pycolmap.Rigid3d(pose.matrix),
-        )  # fmt: skip
-    by_point = np.split(np.argsort(table[:, 1], kind="stable"), np.cumsum(np.bincount(table[:, 1].astype(int)))[:-1])
-    for xyz, rows in zip(points3D, by_point, strict=True):
-        elements = [pycolmap.TrackElement(int(table[o, 0]) + 1, int(position[o])) for o in rows]
-        reconstruction.add_point3D(xyz, pycolmap.Track(elements))
-    return reconstruction
+    def to_json(self) -> dict[str, object]:
+        """All figures and what holds."""
+        return {**dataclasses.asdict(self), "wanted_ratio": self.wanted_ratio, "holds": self.holds}
 
 
-def synthesize(images: int, points: int, track_length: int = -1) -> pycolmap.Reconstruction:
-    """One shared SIMPLE_RADIAL camera, 0.5 px noise, poses and points displaced."""
-    pycolmap.set_random_seed(0)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_frames_per_rig = 1, images
-    options.num_points3D, options.track_length = points, track_length
-    options.num_points2D_without_point3D = 0
-    reconstruction = pycolmap.synthesize_dataset(options)
-    noise = pycolmap.SyntheticNoiseOptions()
-    noise.point2D_stddev, noise.point3D_stddev = 0.5, 0.02
-    noise.rig_from_world_translation_stddev, noise.rig_from_world_rotation_stddev = 0.02, 0.3
-    pycolmap.synthesize_noise(noise, reconstruction)
-    return reconstruction
+_HEAD = (
+    f"{'problem':30} {'intr.':5} {'img':>5} {'points':>7} {'obs':>8} {'start px':>8} {'our cost':>14} {'rel.':>8} "
+    f"{'ours s':>8} {'Ceres s':>8} {'ratio':>6} {'steps':>7} {'memory MB':>11} {'cost':>4} {'time':>4} {'mem.':>4}"
+)
 
 
-def problem_of(reconstruction: pycolmap.Reconstruction, refine: bool) -> BundleProblem:
-    """The same numbers for our side."""
-    cameras, images = sorted(reconstruction.cameras), sorted(reconstruction.reg_image_ids())
-    params, free = np.zeros((len(cameras), 12)), np.zeros((len(cameras), 12), bool)
-    for row, camera_id in enumerate(cameras):
-        camera = reconstruction.cameras[camera_id]
-        params[row, : len(camera.params)] = camera.params
-        free[row, [*camera.focal_length_idxs(), *camera.extra_params_idxs()]] = refine
-    poses = [reconstruction.images[k].cam_from_world() for k in images]
-    keypoints = {k: np.array([p.xy for p in reconstruction.images[k].points2D]) for k in images}
-    row_of = {k: row for row, k in enumerate(images)}
-    points3D, columns = [], []
-    for row, k in enumerate(sorted(reconstruction.points3D)):
-        point = reconstruction.points3D[k]
-        points3D.append(point.xyz)
-        columns += [(row_of[e.image_id], row, *keypoints[e.image_id][e.point2D_idx]) for e in point.track.elements]
-    table = np.array(columns)
-    return BundleProblem(
-        model_ids=np.array([int(reconstruction.cameras[k].model) for k in cameras], np.int32),
-        camera_params=params,
-        image_cameras=np.searchsorted(cameras, [reconstruction.images[k].camera_id for k in images]).astype(np.int32),
-        cams_from_world=Rigid3(
-            Rotation3(np.array([p.rotation.quat for p in poses])[:, [3, 0, 1, 2]]),
-            np.array([p.translation for p in poses]),
-        ),
-        points3D=np.array(points3D),
-        obs_images=table[:, 0].astype(np.int32),
-        obs_points=table[:, 1].astype(np.int32),
-        obs_points2D=np.ascontiguousarray(table[:, 2:]),
-        free_params=free,
-        free_poses=np.ones(len(images), bool),
-        free_points=np.ones(len(points3D), bool),
+def parse() -> argparse.Namespace:
+    """The command line; see the module."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problems", nargs="*", type=Path, metavar="PROBLEM")
+    parser.add_argument("--synthetic", nargs="*", default=[], metavar="SIZE")
+    parser.add_argument("--street", nargs="*", default=[], metavar="SIZE")
+    parser.add_argument("--intrinsics", nargs="+", choices=["free", "fixed"], default=["free"])
+    parser.add_argument("--fix-intrinsics", action="store_const", const=["fixed"], dest="intrinsics")
+    parser.add_argument("--disturb", type=float, default=0.0, help="part of the distances, and radians")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--tolerance", type=float, default=1e-8)
+    parser.add_argument("--gradient-tolerance", type=float, default=1e-4)
+    parser.add_argument("--max-iterations", type=int, default=100)
+    parser.add_argument("--loss", choices=list(LOSSES), default="trivial")
+    parser.add_argument("--loss-scale", type=float, default=1.0)
+    parser.add_argument("--ours", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of BundleConfig")
+    parser.add_argument("--ceres-solver", choices=list(SOLVERS), default="auto")
+    parser.add_argument("--ceres-too", action="store_true", help="on streets as well")
+    parser.add_argument("--no-ceres", action="store_true", help="only our side")
+    parser.add_argument("--no-memory", action="store_true", help="without the processes that measure it")
+    parser.add_argument("--curve", action="store_true", help="cost against time, both sides, as a table")
+    parser.add_argument("--plot", type=Path, metavar="FILE.png", help="… and drawn")
+    parser.add_argument("--cache", type=Path, metavar="FOLDER", help="keeps synthetic problems")
+    parser.add_argument("--json", action="store_true")
+    args = parser.parse_args()
+    if not (args.problems or args.synthetic or args.street):
+        args.synthetic = ["20x5000", "100x20000x10"]
+    return args
+
+
+def rules_of(args: argparse.Namespace) -> Rules:
+    """What both sides are told."""
+    return Rules(
+        threads=args.threads,
+        tolerance=args.tolerance,
+        gradient_tolerance=args.gradient_tolerance,
+        max_iterations=args.max_iterations,
+        loss=args.loss,
+        loss_scale=args.loss_scale,
+        ceres_solver=args.ceres_solver,
+        ours=tuple(tuple(item.split("=", 1)) for item in args.ours),
     )
 
 
-def ceres_options(args: argparse.Namespace) -> pycolmap.BundleAdjustmentOptions:
-    """What makes Ceres do the same."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.refine_focal_length = options.refine_extra_params = not args.fix_intrinsics
-    options.ceres.loss_function_type, options.ceres.loss_function_scale = LOSSES[args.loss], args.loss_scale
-    solver = options.ceres.solver_options
-    solver.function_tolerance, solver.max_num_iterations = args.tolerance, args.max_iterations
-    solver.num_threads = args.threads
-    return options
+def listed(args: argparse.Namespace) -> Iterator[tuple[str, BundleProblem, bool]]:
+    """Name, problem and whether Ceres takes part."""
+    for path in args.problems:
+        problem = problems.read_problem(path)
+        name = path.name
+        if path.is_dir():
+            name = "/".join(path.resolve().parts[-3:])
+            problem = problems.disturbed(problem, args.disturb) if args.disturb else problem
+        yield name, problem, not args.no_ceres
+    for size in args.synthetic:
+        yield size, problems.remembered("synthetic", size, args.cache), not args.no_ceres
+    for size in args.street:
+        yield f"street {size}", problems.remembered("street", size, args.cache), args.ceres_too and not args.no_ceres
 
 
-def race(
-    problem: BundleProblem, config: BundleConfig, start: pycolmap.Reconstruction,
-    options: pycolmap.BundleAdjustmentOptions, threads: int,
-) -> tuple[BundleResult, pycolmap.Reconstruction, float, float]:  # fmt: skip
-    """Both sides once: our result, their model, and the seconds of each."""
-    began = time.perf_counter()
-    result = adjust(problem, config, threads=threads)
-    ours = time.perf_counter() - began
-    reconstruction = pycolmap.Reconstruction(start)
-    began = time.perf_counter()
-    pycolmap.bundle_adjustment(reconstruction, options)
-    return result, reconstruction, ours, time.perf_counter() - began
-
-
-def compare(name: str, start: pycolmap.Reconstruction, args: argparse.Namespace) -> Row:
-    """Runs both sides `args.repeats` times in turns."""
-    config = BundleConfig(
-        loss=args.loss, loss_scale_px=args.loss_scale,
-        relative_cost_tolerance=args.tolerance, max_iterations=args.max_iterations,
-    )  # fmt: skip
-    problem, options = problem_of(start, not args.fix_intrinsics), ceres_options(args)
-    runs = [race(problem, config, start, options, args.threads) for _ in range(max(args.repeats, 1))]
-    result, reconstruction, _, _ = runs[-1]
-    their_problem = problem_of(reconstruction, not args.fix_intrinsics)
-    their_result = adjust(their_problem, dataclasses.replace(config, max_iterations=0))
+def compare(name: str, problem: BundleProblem, rules: Rules, with_ceres: bool, args: argparse.Namespace) -> Row:
+    """Runs both sides `args.repeats` times in turns, and what else was asked for."""
+    warm_up(problem, rules)
+    outcome = race(problem, rules, max(args.repeats, 1), with_ceres)
+    sides = ("ours", "ceres") if with_ceres else ("ours",)
+    memory = {} if args.no_memory else {side: peak_memory_mb(problem, rules, side) for side in sides}
+    wanted = args.curve or args.plot is not None
     return Row(
         name=name,
+        intrinsics="free" if problem.free_params.any() else "fixed",
         images=len(problem.free_poses),
         points=len(problem.free_points),
         observations=len(problem.obs_images),
-        invalid=result.invalid,
-        initial_cost=result.initial_cost,
-        our_cost=result.final_cost,
-        their_cost=their_result.final_cost,
-        our_iterations=result.iterations,
-        our_reason=result.reason,
-        our_seconds=statistics.median(ours for _, _, ours, _ in runs),
-        their_seconds=statistics.median(theirs for _, _, _, theirs in runs),
-        ratio=statistics.median(theirs / ours for _, _, ours, theirs in runs),
+        start_px=problems.start_error_px(problem),
+        outcome=outcome,
+        our_memory_mb=memory.get("ours"),
+        ceres_memory_mb=memory.get("ceres"),
+        curve=curves(problem, rules, sides) if wanted else None,
     )
 
 
 def main() -> None:
     """Prints a row for each problem, or all rows as JSON."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bal", nargs="*", type=Path)
-    parser.add_argument("--synthetic", nargs="*", default=["6x350", "20x5000", "100x20000x10"])
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--tolerance", type=float, default=1e-8)
-    parser.add_argument("--max-iterations", type=int, default=100)
-    parser.add_argument("--loss", choices=list(LOSSES), default="trivial")
-    parser.add_argument("--loss-scale", type=float, default=1.0)
-    parser.add_argument("--fix-intrinsics", action="store_true")
-    parser.add_argument("--json", action="store_true")
-    args = parser.parse_args()
-    pycolmap.logging.minloglevel = pycolmap.logging.WARNING.value
-
-    warm_up = synthesize(3, 40)
-    for refine in (True, False):
-        adjust(problem_of(warm_up, refine), threads=args.threads)
-    rows = []
-    problems = [(str(path.name), lambda path=path: read_bal(path)) for path in args.bal]
-    problems += [(size, lambda size=size: synthesize(*map(int, size.split("x")))) for size in args.synthetic]
-    if not args.json:
-        head = ("problem", "img", "points", "obs", "our cost", "rel.", "ours", "Ceres")
-        print("{:28} {:>5} {:>7} {:>8}  {:>14} {:>9}  {:>10} {:>10}".format(*head))
-    for name, make in problems:
-        rows.append(compare(name, make(), args))
+    if sys.argv[1:2] == ["--run-side"]:  # in the process that `peak_memory_mb` starts
+        run_side(sys.argv[2:])
+        return
+    args = parse()
+    rules, rows = rules_of(args), []
+    with contextlib.suppress(BrokenPipeError):
         if not args.json:
-            print(rows[-1], flush=True)
-    if args.json:
-        print(json.dumps([dataclasses.asdict(row) for row in rows], indent=2))
+            print(_HEAD)
+        for name, problem, with_ceres in listed(args):
+            for intrinsics in args.intrinsics:
+                chosen = problem if intrinsics == "free" else problems.with_fixed_intrinsics(problem)
+                rows.append(compare(name, chosen, rules, with_ceres, args))
+                if not args.json:
+                    print(rows[-1], flush=True)
+                    if args.curve and rows[-1].curve is not None:
+                        print(curve_table(rows[-1].curve), flush=True)
+        if args.json:
+            print(json.dumps([row.to_json() for row in rows], indent=2))
+    if args.plot is not None:
+        draw([(f"{row.name}, intrinsics {row.intrinsics}", row.curve) for row in rows if row.curve], args.plot)
 
 
 if __name__ == "__main__":

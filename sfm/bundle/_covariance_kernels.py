@@ -5,25 +5,27 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from sfm.core.optim._block_kernels import WIDTH
+from sfm.core.optim._schur_kernels import fill_coupling
+
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def point_covariances(
-    free, offsets, starts, slot, coupling_offsets, coupling_slot, W, B, V, M, sigma, poses, condition, out
+    free, offsets, starts, slot, N, shared_starts, shared_slot, B, centers, X, V, M, sigma, condition, out
 ):  # fmt: skip
     """Fills `out` (P, 3, 3) with M + M Eᵀ Σ E M; NaN for points that are free and not determined.
 
     Args:
-        slot, W: row of the pose and transposed coupling (n, 3, 6) of each observation, used from `starts` (P,) on.
-        coupling_offsets, coupling_slot, B: the same for cameras, (P + 1,), (E,), (E, 3, K).
+        offsets: (P + 1,) observations of the points.
+        starts … B, centers, X: couplings as in `sfm.core.optim.schur`.
         V, M: information (P, 6) about each point alone, and its inverse.
-        sigma: (N, N); poses first, six entries each, `poses` of them, then cameras, K each.
+        sigma: (6 rows, 6 rows).
     """
-    K, widest = B.shape[2], 0
+    widest = 1
     for p in range(len(out)):
-        size = 6 * (offsets[p + 1] - starts[p]) + K * (coupling_offsets[p + 1] - coupling_offsets[p])
-        widest = max(widest, size)
+        widest = max(widest, 6 * (starts[p + 1] - starts[p] + shared_starts[p + 1] - shared_starts[p]))
     rows, T, U = np.empty(widest, np.int64), np.empty((3, widest)), np.empty((3, widest))
-    m = np.empty((3, 3))
+    m, w = np.empty((3, 3)), np.empty((3, WIDTH))
     for p in range(len(out)):
         if not free[p]:
             continue
@@ -32,14 +34,16 @@ def point_covariances(
             out[p] = np.nan
             continue
         size = 0
-        for o in range(starts[p], offsets[p + 1]):
+        for e in range(starts[p], starts[p + 1]):
+            s = slot[e]
+            fill_coupling(N[e], X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2], w)
             for a in range(6):
-                rows[size] = 6 * slot[o] + a
-                T[0, size], T[1, size], T[2, size] = W[o, 0, a], W[o, 1, a], W[o, 2, a]
+                rows[size] = 6 * s + a
+                T[0, size], T[1, size], T[2, size] = w[0, a], w[1, a], w[2, a]
                 size += 1
-        for e in range(coupling_offsets[p], coupling_offsets[p + 1]):
-            for a in range(K):
-                rows[size] = 6 * poses + K * coupling_slot[e] + a
+        for e in range(shared_starts[p], shared_starts[p + 1]):
+            for a in range(6):
+                rows[size] = 6 * shared_slot[e] + a
                 T[0, size], T[1, size], T[2, size] = B[e, 0, a], B[e, 1, a], B[e, 2, a]
                 size += 1
         m[0, 0], m[0, 1], m[0, 2] = M[p, 0], M[p, 1], M[p, 2]

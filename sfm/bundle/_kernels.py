@@ -7,153 +7,192 @@ import math
 import numba as nb
 import numpy as np
 
-from sfm.core.cameras._kernels import project_point, project_point_jacobians
-from sfm.core.optim._block_kernels import add_combination, add_gram, set_product
+from sfm.bundle import _lane_kernels as lanes
+from sfm.core.cameras._kernels import MAX_PARAMS, distortion_limit, project_point
+from sfm.core.cameras._lane_kernels import BY_PARAMS, LANES, fill_by_param, project_lanes
 from sfm.core.optim._loss_kernels import loss_and_weight
 from sfm.core.optim._schur_kernels import damped_diagonal
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def squared_errors(image, point, observed, camera, model_ids, params, R, t, X, out):
-    """Squared reprojection errors in px²; NaN where there is no projection."""
-    for o in range(len(image)):
-        i, p = image[o], point[o]
-        x0, x1, x2 = X[p, 0], X[p, 1], X[p, 2]
-        x = R[i, 0, 0] * x0 + R[i, 0, 1] * x1 + R[i, 0, 2] * x2 + t[i, 0]
-        y = R[i, 1, 0] * x0 + R[i, 1, 1] * x1 + R[i, 1, 2] * x2 + t[i, 1]
-        z = R[i, 2, 0] * x0 + R[i, 2, 1] * x1 + R[i, 2, 2] * x2 + t[i, 2]
-        c = camera[i]
-        u, v, ok = project_point(model_ids[c], params[c], x, y, z)
-        du, dv = u - observed[o, 0], v - observed[o, 1]
-        out[o] = du * du + dv * dv if ok else np.nan
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def linearize(
-    first, last, offsets, image, observed, precision, coupling, point_free, camera, model_ids, columns, pose_slot,
-    R, t, params, X, loss, scale, lost_cost, H, F, h, V, g, W, B,
+def linearize_images(
+    first, last, offsets, point, place, observed, precision, slot, camera, model_ids, limits, column_count, columns,
+    R, t, centers, params, X, loss, scale, lost_cost, out, h, F, G, f,
 ):  # fmt: skip
-    """Cost ½ Σ ρ of the points `first:last`, and the blocks of their normal equations.
+    """Cost ½ Σ ρ of the images `first:last` and their share of the normal equations; see `system`.
 
-    Adds, for every image, the products of its pose with itself to H (I, 6, 6), those of its camera with the pose
-    and with itself to F (I, K, 6 + K), and the gradient to h (I, 6 + K). Fills V and g of the points and W of the
-    observations, and adds to B of their couplings with cameras.
+    Args:
+        offsets, point, place: observations by image (I + 1,), their points and their places in the order by points.
+        slot, centers: row of each image's frame, −1 where it does not move, and the centres by row.
+        column_count, columns: how many free columns an image shares with others, and which (I, k): parameters, or
+            from MAX_PARAMS on the tangent of its sensor.
+        out: (n, 9 + 3 k) gets PᵀP, Pᵀe and the products of P with the columns, in the order by points.
+        h, F, G, f: (I, 6), (I, 6, k), (I, k, k) and (I, k) get the gradient of the frame, the products of its tangent
+            with the columns, those of the columns (lower triangle), and the columns' gradient.
     """
-    K = columns.shape[1]
-    A, Q, J, P, C = np.empty((2, 3)), np.empty((2, 12)), np.empty((2, 6)), np.empty((2, 3)), np.empty((2, K))
+    w = np.zeros(lanes.ROWS * LANES)
     cost = 0.0
-    for p in range(first, last):
-        x0, x1, x2 = X[p, 0], X[p, 1], X[p, 2]
-        v0 = v1 = v2 = v3 = v4 = v5 = g0 = g1 = g2 = 0.0
-        for o in range(offsets[p], offsets[p + 1]):
-            i = image[o]
-            c = camera[i]
-            r = R[i]
-            x = r[0, 0] * x0 + r[0, 1] * x1 + r[0, 2] * x2 + t[i, 0]
-            y = r[1, 0] * x0 + r[1, 1] * x1 + r[1, 2] * x2 + t[i, 1]
-            z = r[2, 0] * x0 + r[2, 1] * x1 + r[2, 2] * x2 + t[i, 2]
-            u, v, ok = project_point_jacobians(model_ids[c], params[c], x, y, z, A, Q)
-            if not ok:
-                cost += lost_cost
-                W[o, :, :] = 0.0
-                continue
-            root = precision[o]
-            eu, ev = (u - observed[o, 0]) * root, (v - observed[o, 1]) * root
-            rho, weight = loss_and_weight(loss, scale, eu * eu + ev * ev)
-            cost += 0.5 * rho
-            weight = math.sqrt(weight)
-            eu, ev = eu * weight, ev * weight
-            root *= weight
-            a0, a1, a2 = A[0, 0] * root, A[0, 1] * root, A[0, 2] * root
-            b0, b1, b2 = A[1, 0] * root, A[1, 1] * root, A[1, 2] * root
-            # exp(δ) x = x + ω × x + υ to first order, and a · (ω × x) = ω · (x × a).
-            J[0, 0], J[0, 1], J[0, 2] = y * a2 - z * a1, z * a0 - x * a2, x * a1 - y * a0
-            J[1, 0], J[1, 1], J[1, 2] = y * b2 - z * b1, z * b0 - x * b2, x * b1 - y * b0
-            J[0, 3], J[0, 4], J[0, 5], J[1, 3], J[1, 4], J[1, 5] = a0, a1, a2, b0, b1, b2
-            moving = pose_slot[i] >= 0
-            if moving:
-                add_gram(H[i], J)
-                add_combination(h[i], eu, ev, J)
-            k = 0
-            while k < K and columns[c, k] >= 0:
-                ca, cb = Q[0, columns[c, k]] * root, Q[1, columns[c, k]] * root
-                C[0, k], C[1, k] = ca, cb
-                h[i, 6 + k] += ca * eu + cb * ev
-                add_combination(F[i, k], ca, cb, J)
-                for a in range(k + 1):
-                    F[i, k, 6 + a] += ca * C[0, a] + cb * C[1, a]
-                k += 1
-            if not point_free[p]:
-                continue
-            p0 = a0 * r[0, 0] + a1 * r[1, 0] + a2 * r[2, 0]
-            p1 = a0 * r[0, 1] + a1 * r[1, 1] + a2 * r[2, 1]
-            p2 = a0 * r[0, 2] + a1 * r[1, 2] + a2 * r[2, 2]
-            q0 = b0 * r[0, 0] + b1 * r[1, 0] + b2 * r[2, 0]
-            q1 = b0 * r[0, 1] + b1 * r[1, 1] + b2 * r[2, 1]
-            q2 = b0 * r[0, 2] + b1 * r[1, 2] + b2 * r[2, 2]
-            g0, g1, g2 = g0 + p0 * eu + q0 * ev, g1 + p1 * eu + q1 * ev, g2 + p2 * eu + q2 * ev
-            v0, v1, v2 = v0 + p0 * p0 + q0 * q0, v1 + p0 * p1 + q0 * q1, v2 + p0 * p2 + q0 * q2
-            v3, v4, v5 = v3 + p1 * p1 + q1 * q1, v4 + p1 * p2 + q1 * q2, v5 + p2 * p2 + q2 * q2
-            if moving:
-                P[0, 0], P[0, 1], P[0, 2], P[1, 0], P[1, 1], P[1, 2] = p0, p1, p2, q0, q1, q2
-                set_product(W[o], P, J)
-            if k > 0:
-                block = B[coupling[o]]
-                for a in range(k):
-                    block[0, a] += p0 * C[0, a] + q0 * C[1, a]
-                    block[1, a] += p1 * C[0, a] + q1 * C[1, a]
-                    block[2, a] += p2 * C[0, a] + q2 * C[1, a]
-        V[p, 0], V[p, 1], V[p, 2], V[p, 3], V[p, 4], V[p, 5] = v0, v1, v2, v3, v4, v5
-        g[p, 0], g[p, 1], g[p, 2] = g0, g1, g2
+    for i in range(first, last):
+        c, own, count = camera[i], slot[i] >= 0, column_count[i]
+        for begin in range(offsets[i], offsets[i + 1], LANES):
+            lanes.fetch(begin, offsets[i + 1], point, observed, precision, X, w)
+            lanes.transform(R[i], t[i], w)
+            project_lanes(model_ids[c], params[c], limits[c], w)
+            lanes.weigh(loss, scale, lost_cost, w)
+            lanes.derive_by_point(R[i], w)
+            for k in range(count):
+                column = columns[i, k]
+                if column < MAX_PARAMS:
+                    fill_by_param(model_ids[c], params[c], column, w)
+                    lanes.derive_by_column(k, BY_PARAMS + 2 * column, w)
+                else:
+                    lanes.derive_by_sensor(column - MAX_PARAMS, w)
+                    lanes.derive_by_column(k, lanes.BY_SENSOR, w)
+            if own:
+                lanes.derive_by_turn(centers[slot[i]], w)
+                for a in range(6):
+                    u, v = _tangent_rows(a)
+                    h[i, a] += lanes.total(u, lanes.ERROR, v, lanes.ERROR + 1, w)
+                    for k in range(count):
+                        column = lanes.BY_COLUMN + 2 * k
+                        F[i, a, k] += lanes.total(u, column, v, column + 1, w)
+            for k in range(count):
+                row = lanes.BY_COLUMN + 2 * k
+                f[i, k] += lanes.total(row, lanes.ERROR, row + 1, lanes.ERROR + 1, w)
+                for j in range(k + 1):
+                    column = lanes.BY_COLUMN + 2 * j
+                    G[i, k, j] += lanes.total(row, column, row + 1, column + 1, w)
+            for n in range(min(LANES, offsets[i + 1] - begin)):
+                cost += 0.5 * w[lanes.COST * LANES + n]
+                target = out[place[begin + n]]
+                for a in range(9 + 3 * count):
+                    target[a] = w[(lanes.OUT + a) * LANES + n]
     return cost
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def try_points(
-    first, last, offsets, image, observed, precision, starts, slot, coupling_offsets, coupling_slot, camera, model_ids,
-    R, t, params, X, loss, scale, lost_cost, damping, M, V, g, W, B, pose_delta, camera_delta, moved, totals,
-):  # fmt: skip
-    """Steps of the points `first:last` by back-substitution, and the cost where everything has moved.
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _tangent_rows(a):
+    """Rows with the derivatives of u and v by entry `a` of the tangent of the frame."""
+    if a < 3:
+        return lanes.BY_TURN + a, lanes.BY_TURN + 3 + a
+    return lanes.BY_POINT_IN_WORLD + a - 3, lanes.BY_POINT_IN_WORLD + a
 
-    A point whose step would lose projections that it keeps where it stands is left where it stands.
-    Fills `moved`, and `totals` with the cost, the promised decrease, |δ|², |X|² and the lost projections.
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def costs_of_images(
+    first, last, offsets, point, place, observed, precision, camera, model_ids, limits, R, t, params, X,
+    loss, scale, out,
+):  # fmt: skip
+    """ρ of the observations of the images `first:last`, in the order by points; NaN where there is no projection."""
+    w = np.zeros(lanes.ROWS * LANES)
+    for i in range(first, last):
+        c = camera[i]
+        for begin in range(offsets[i], offsets[i + 1], LANES):
+            lanes.fetch(begin, offsets[i + 1], point, observed, precision, X, w)
+            lanes.transform(R[i], t[i], w)
+            project_lanes(model_ids[c], params[c], limits[c], w)
+            lanes.weigh(loss, scale, np.nan, w)
+            for n in range(min(LANES, offsets[i + 1] - begin)):
+                out[place[begin + n]] = w[lanes.COST * LANES + n]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def gather_points(
+    first, last, offsets, slot, column_count, column_place, image, obs_shared, starts, point_free, rows, V, g, N, B
+):  # fmt: skip
+    """Sums what images have put into `rows` over the points `first:last`: V, g and the couplings N and B."""
+    for p in range(first, last):
+        v0 = v1 = v2 = v3 = v4 = v5 = g0 = g1 = g2 = 0.0
+        coupling, before = starts[p] - 1, -1
+        for o in range(offsets[p], offsets[p + 1]):
+            r = rows[o]
+            v0, v1, v2, v3, v4, v5 = v0 + r[0], v1 + r[1], v2 + r[2], v3 + r[3], v4 + r[4], v5 + r[5]
+            g0, g1, g2 = g0 + r[6], g1 + r[7], g2 + r[8]
+            if slot[o] > before:
+                before = slot[o]
+                coupling += 1
+                for a in range(6):
+                    N[coupling, a] = r[a]
+            elif slot[o] >= 0:
+                for a in range(6):
+                    N[coupling, a] += r[a]
+            if point_free[p]:
+                i = image[o]
+                for k in range(column_count[i]):
+                    block, a = B[obs_shared[o, column_place[i, k] // 6]], column_place[i, k] % 6
+                    block[0, a] += r[9 + 3 * k]
+                    block[1, a] += r[10 + 3 * k]
+                    block[2, a] += r[11 + 3 * k]
+        if not point_free[p]:
+            v0 = v1 = v2 = v3 = v4 = v5 = g0 = g1 = g2 = 0.0
+        V[p, 0], V[p, 1], V[p, 2], V[p, 3], V[p, 4], V[p, 5] = v0, v1, v2, v3, v4, v5
+        g[p, 0], g[p, 1], g[p, 2] = g0, g1, g2
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def move_points(
+    first, last, starts, slot, N, shared_starts, shared_slot, B, centers, X, M, g, delta, moved
+):  # fmt: skip
+    """The points `first:last` after the step that back-substitution gives them."""
+    for p in range(first, last):
+        y0, y1, y2 = X[p, 0], X[p, 1], X[p, 2]
+        if not M[p, 0] > 0.0:
+            moved[p, 0], moved[p, 1], moved[p, 2] = y0, y1, y2
+            continue
+        q0, q1, q2 = g[p, 0], g[p, 1], g[p, 2]
+        for e in range(starts[p], starts[p + 1]):
+            s, n = slot[e], N[e]
+            d = delta[s]
+            u0, u1, u2 = y0 - centers[s, 0], y1 - centers[s, 1], y2 - centers[s, 2]
+            w0 = d[1] * u2 - d[2] * u1 + d[3]
+            w1 = d[2] * u0 - d[0] * u2 + d[4]
+            w2 = d[0] * u1 - d[1] * u0 + d[5]
+            q0 += n[0] * w0 + n[1] * w1 + n[2] * w2
+            q1 += n[1] * w0 + n[3] * w1 + n[4] * w2
+            q2 += n[2] * w0 + n[4] * w1 + n[5] * w2
+        for e in range(shared_starts[p], shared_starts[p + 1]):
+            d, block = delta[shared_slot[e]], B[e]
+            for a in range(6):
+                q0 += block[0, a] * d[a]
+                q1 += block[1, a] * d[a]
+                q2 += block[2, a] * d[a]
+        moved[p, 0] = y0 - (M[p, 0] * q0 + M[p, 1] * q1 + M[p, 2] * q2)
+        moved[p, 1] = y1 - (M[p, 1] * q0 + M[p, 3] * q1 + M[p, 4] * q2)
+        moved[p, 2] = y2 - (M[p, 2] * q0 + M[p, 4] * q1 + M[p, 5] * q2)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def settle_points(
+    first, last, offsets, source, image, observed, precision, camera, model_ids, R, t, params, X, loss, scale,
+    lost_cost, damping, V, g, costs, moved, totals,
+):  # fmt: skip
+    """Adds up the points `first:last` of a trial, and leaves in its place a point that would lose projections there.
+
+    `costs` holds ρ of each observation at `moved`, `source` where it stands in the order by images.
+    Fills `totals` with the cost, the promised decrease, |δ|², |X|² and the lost projections.
     """
-    K = B.shape[2]
     cost = decrease = step = norm = all_lost = 0.0
     for p in range(first, last):
-        q0, q1, q2 = g[p, 0], g[p, 1], g[p, 2]
-        for o in range(starts[p], offsets[p + 1]):
-            w, d = W[o], pose_delta[slot[o]]
-            for a in range(6):
-                q0 += w[0, a] * d[a]
-                q1 += w[1, a] * d[a]
-                q2 += w[2, a] * d[a]
-        for e in range(coupling_offsets[p], coupling_offsets[p + 1]):
-            for a in range(K):
-                s = camera_delta[coupling_slot[e] * K + a]
-                q0 += B[e, 0, a] * s
-                q1 += B[e, 1, a] * s
-                q2 += B[e, 2, a] * s
-        d0 = -(M[p, 0] * q0 + M[p, 1] * q1 + M[p, 2] * q2)
-        d1 = -(M[p, 1] * q0 + M[p, 3] * q1 + M[p, 4] * q2)
-        d2 = -(M[p, 2] * q0 + M[p, 4] * q1 + M[p, 5] * q2)
-        best_cost, best_lost = np.inf, offsets[p + 1] - offsets[p] + 1
-        s0 = s1 = s2 = 0.0
-        for attempt in range(2):
-            if attempt == 1:
-                d0 = d1 = d2 = 0.0
-            x0, x1, x2 = X[p, 0] + d0, X[p, 1] + d1, X[p, 2] + d2
+        if offsets[p] == offsets[p + 1]:
+            continue
+        best_cost, best_lost = 0.0, 0
+        for o in range(offsets[p], offsets[p + 1]):
+            if math.isnan(costs[o]):
+                best_cost += lost_cost
+                best_lost += 1
+            else:
+                best_cost += 0.5 * costs[o]
+        if best_lost > 0:
             here, lost = 0.0, 0
             for o in range(offsets[p], offsets[p + 1]):
-                i = image[o]
-                c = camera[i]
-                r = R[i]
-                x = r[0, 0] * x0 + r[0, 1] * x1 + r[0, 2] * x2 + t[i, 0]
-                y = r[1, 0] * x0 + r[1, 1] * x1 + r[1, 2] * x2 + t[i, 1]
-                z = r[2, 0] * x0 + r[2, 1] * x1 + r[2, 2] * x2 + t[i, 2]
+                i, s = image[o], source[o]
+                c, r = camera[i], R[i]
+                x = r[0, 0] * X[p, 0] + r[0, 1] * X[p, 1] + r[0, 2] * X[p, 2] + t[i, 0]
+                y = r[1, 0] * X[p, 0] + r[1, 1] * X[p, 1] + r[1, 2] * X[p, 2] + t[i, 1]
+                z = r[2, 0] * X[p, 0] + r[2, 1] * X[p, 1] + r[2, 2] * X[p, 2] + t[i, 2]
                 u, v, ok = project_point(model_ids[c], params[c], x, y, z)
                 if ok:
-                    eu, ev = (u - observed[o, 0]) * precision[o], (v - observed[o, 1]) * precision[o]
+                    eu, ev = (u - observed[s, 0]) * precision[s], (v - observed[s, 1]) * precision[s]
                     rho, _ = loss_and_weight(loss, scale, eu * eu + ev * ev)
                     here += 0.5 * rho
                 else:
@@ -161,10 +200,8 @@ def try_points(
                     lost += 1
             if lost < best_lost:
                 best_cost, best_lost = here, lost
-                s0, s1, s2 = d0, d1, d2
-                moved[p, 0], moved[p, 1], moved[p, 2] = x0, x1, x2
-            if lost == 0:
-                break
+                moved[p, 0], moved[p, 1], moved[p, 2] = X[p, 0], X[p, 1], X[p, 2]
+        s0, s1, s2 = moved[p, 0] - X[p, 0], moved[p, 1] - X[p, 1], moved[p, 2] - X[p, 2]
         cost += best_cost
         all_lost += best_lost
         decrease -= 0.5 * (g[p, 0] * s0 + g[p, 1] * s1 + g[p, 2] * s2)
@@ -176,39 +213,32 @@ def try_points(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def move_poses(images, delta, wxyz, t, new_wxyz, new_t, R):
-    """exp(δ) from the left on the poses of `images`; fills quaternions, translations and rotation matrices."""
-    for k in range(len(images)):
-        i = images[k]
+def squared_limits(model_ids, params):
+    """(C,) the square of the radius up to which each camera's distortion can be inverted."""
+    out = np.empty(len(model_ids))
+    for c in range(len(model_ids)):
+        limit = distortion_limit(model_ids[c], params[c])
+        out[c] = limit * limit
+    return out
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def turn_poses(frames, delta, wxyz, centers, new_wxyz, new_centers):
+    """Moves the poses `frames` by δ = (ω, υ) in world axes: R exp(ω), and the centre to C − υ."""
+    for k in range(len(frames)):
+        i = frames[k]
         w0, w1, w2 = delta[k, 0], delta[k, 1], delta[k, 2]
-        u0, u1, u2 = delta[k, 3], delta[k, 4], delta[k, 5]
         square = w0 * w0 + w1 * w1 + w2 * w2
         angle = math.sqrt(square)
-        if angle < 1e-4:
-            half, b, c = 0.5 - square / 48.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-        else:
-            half = math.sin(0.5 * angle) / angle
-            b, c = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
+        half = 0.5 - square / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
         q0, q1, q2, q3 = math.cos(0.5 * angle), half * w0, half * w1, half * w2
         p0, p1, p2, p3 = wxyz[i, 0], wxyz[i, 1], wxyz[i, 2], wxyz[i, 3]
-        n0 = q0 * p0 - q1 * p1 - q2 * p2 - q3 * p3
-        n1 = q0 * p1 + q1 * p0 + q2 * p3 - q3 * p2
-        n2 = q0 * p2 - q1 * p3 + q2 * p0 + q3 * p1
-        n3 = q0 * p3 + q1 * p2 - q2 * p1 + q3 * p0
+        n0 = p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3
+        n1 = p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2
+        n2 = p0 * q2 - p1 * q3 + p2 * q0 + p3 * q1
+        n3 = p0 * q3 + p1 * q2 - p2 * q1 + p3 * q0
         scale = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2 + n3 * n3)
-        n0, n1, n2, n3 = n0 * scale, n1 * scale, n2 * scale, n3 * scale
-        new_wxyz[i, 0], new_wxyz[i, 1], new_wxyz[i, 2], new_wxyz[i, 3] = n0, n1, n2, n3
-        R[i, 0, 0], R[i, 0, 1] = 1.0 - 2.0 * (n2 * n2 + n3 * n3), 2.0 * (n1 * n2 - n0 * n3)
-        R[i, 0, 2], R[i, 1, 0] = 2.0 * (n1 * n3 + n0 * n2), 2.0 * (n1 * n2 + n0 * n3)
-        R[i, 1, 1], R[i, 1, 2] = 1.0 - 2.0 * (n1 * n1 + n3 * n3), 2.0 * (n2 * n3 - n0 * n1)
-        R[i, 2, 0], R[i, 2, 1] = 2.0 * (n1 * n3 - n0 * n2), 2.0 * (n2 * n3 + n0 * n1)
-        R[i, 2, 2] = 1.0 - 2.0 * (n1 * n1 + n2 * n2)
-        # exp(ω) x = x + a ω × x + b ω × (ω × x) with a = sin θ / θ = 1 − c θ², and the same with b, c for Jl(ω).
-        a = 1.0 - c * square
-        t0, t1, t2 = t[i, 0], t[i, 1], t[i, 2]
-        x0, x1, x2 = w1 * t2 - w2 * t1, w2 * t0 - w0 * t2, w0 * t1 - w1 * t0
-        y0, y1, y2 = w1 * u2 - w2 * u1, w2 * u0 - w0 * u2, w0 * u1 - w1 * u0
-        f0, f1, f2 = b * x0 + c * y0, b * x1 + c * y1, b * x2 + c * y2
-        new_t[i, 0] = t0 + u0 + a * x0 + b * y0 + w1 * f2 - w2 * f1
-        new_t[i, 1] = t1 + u1 + a * x1 + b * y1 + w2 * f0 - w0 * f2
-        new_t[i, 2] = t2 + u2 + a * x2 + b * y2 + w0 * f1 - w1 * f0
+        new_wxyz[i, 0], new_wxyz[i, 1] = n0 * scale, n1 * scale
+        new_wxyz[i, 2], new_wxyz[i, 3] = n2 * scale, n3 * scale
+        for a in range(3):
+            new_centers[i, a] = centers[i, a] - delta[k, 3 + a]

@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from sfm.bundle import _kernels as kernels
+from sfm.bundle._layout_kernels import sort_rows
 from sfm.bundle.gauge import held_by_two_cameras
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
@@ -15,7 +16,7 @@ from sfm.bundle.system import BundleSystem
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.events import SILENT, BundleAdjusted, Observer
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
-from sfm.core.optim.losses import evaluate_loss
+from sfm.core.optim.losses import evaluate_loss, loss_id
 
 _LOST_PX = 100.0
 _GRADUAL_STEPS, _MAX_HALVINGS = 5, 20
@@ -48,7 +49,7 @@ def adjust(
     observer(
         BundleAdjusted(
             scope=scope,
-            images=len(system.layout.slot_image),
+            images=len(system.layout.slot_frame),
             points=len(problem.points3D),
             observations=len(system.layout.image),
             iterations=result.iterations,
@@ -65,7 +66,7 @@ def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tup
     squared = squared_errors(problem)
     active = np.isfinite(squared)
     layout = lay_out(problem, active)
-    held = np.zeros((len(layout.slot_image), 6), bool)
+    held = np.zeros((len(layout.slot_frame), 6), bool)
     if config.gauge == "two_cameras":
         held = held_by_two_cameras(problem, layout)
     weighted = squared[active] if problem.obs_sigmas is None else squared[active] / problem.obs_sigmas[active] ** 2
@@ -77,11 +78,15 @@ def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tup
 def squared_errors(problem: BundleProblem) -> FloatArray:
     """|projected − observed|² of every observation (n,) in px²; NaN where there is no projection."""
     # Cameras go to all kernels as int64 and writable, so that projection is compiled once.
-    out = np.empty(len(problem.obs_images))
-    kernels.squared_errors(
-        problem.obs_images, problem.obs_points, problem.obs_points2D, problem.image_cameras,
-        problem.model_ids.astype(np.int64), problem.camera_params.copy(),
-        problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation, problem.points3D, out,
+    model_ids, params = problem.model_ids.astype(np.int64), problem.camera_params.copy()
+    rows = np.arange(len(problem.obs_images), dtype=np.int32)
+    by_image, offsets = sort_rows(rows, problem.obs_images, len(problem.image_cameras))
+    out = np.empty(len(rows))
+    kernels.costs_of_images(
+        0, len(problem.image_cameras), offsets, problem.obs_points[by_image], by_image, problem.obs_points2D[by_image],
+        np.ones(len(rows)), problem.image_cameras.copy(), model_ids, kernels.squared_limits(model_ids, params),
+        problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation, params,
+        problem.points3D.copy(), loss_id("trivial"), 1.0, out,
     )  # fmt: skip
     return out
 
@@ -116,6 +121,7 @@ def _moved(problem: BundleProblem, system: BundleSystem) -> BundleProblem:
         camera_params=system.camera_params,
         cams_from_world=system.cams_from_world,
         points3D=system.points3D,
+        rigs=system.rigs,
     )
 
 

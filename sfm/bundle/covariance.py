@@ -31,6 +31,7 @@ from scipy.linalg import get_lapack_funcs
 
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.bundle.adjustment import system_of
+from sfm.bundle.gauge import frame_centers
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import BundleConfig, BundleProblem
 from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
@@ -81,31 +82,32 @@ def covariance(
 ) -> BundleCovariance | Rejected:
     """Covariances at the parameters of `problem`, which should be a minimum: the `problem` of a `BundleResult`.
 
-    Takes some 32 N² bytes for N free pose and camera parameters.
+    Takes some 32 N² bytes for N free entries of poses, cameras and sensors.
 
     Returns:
-        `undetermined_pose` or `undetermined_camera`, with the row of what the observations leave open as detail.
+        `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave
+        open as detail.
     """
-    system, _ = system_of(problem, config, threads)
+    system, _ = system_of(problem, dataclasses.replace(config, solver="dense"), threads)
     layout, (cost, _) = system.layout, system.linearize()
-    S, eliminated = system.information()
-    motions = _motions(problem, layout)[: len(S)] if config.gauge == "free" else np.zeros((len(S), 0))
-    sigma = _inverse(S, ~system.held, motions)
+    known = system.information()
+    motions = _motions(problem, layout)
+    if config.gauge == "two_cameras":
+        motions = motions[:, :0]
+    sigma = _inverse(known.reduced, ~system.held.ravel(), motions)
     if isinstance(sigma, int):
-        return _undetermined(sigma, layout)
+        return _undetermined(sigma, problem, layout)
     points = np.zeros((len(problem.points3D), 3, 3))
     kernels.point_covariances(
-        problem.free_points, layout.offsets, layout.starts, layout.obs_slot, layout.coupling_offsets,
-        layout.coupling_slot, eliminated.W, eliminated.B, eliminated.V, eliminated.M, sigma, len(layout.slot_image),
+        system.free_points, layout.offsets, *known.couplings, known.centers, system.points3D, known.V, known.M, sigma,
         _POINT_CONDITION, points,
     )  # fmt: skip
-    poses = _pose_blocks(problem, layout, sigma)
-    R = problem.cams_from_world.rotation.matrix
     freedom = 2 * len(layout.image) + system.prior_count - system.free_count + motions.shape[1]
+    poses, centers = _pose_blocks(problem, layout, sigma)
     return BundleCovariance(
         poses=poses,
-        centers=np.einsum("iba,ibc,icd->iad", R, poses[:, 3:, 3:], R),
-        params=_camera_blocks(problem, layout, sigma),
+        centers=centers,
+        params=_camera_blocks(layout, sigma, len(problem.model_ids)),
         points3D=points,
         variance_factor=2 * cost / freedom if freedom > 0 else float("nan"),
     )
@@ -136,51 +138,92 @@ def _inverse(S: FloatArray, free: BoolArray, motions: FloatArray) -> FloatArray 
 
 
 def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
-    """Columns that span the motions of the whole scene, as the tangents of the moving poses and zeros for cameras.
+    """Columns (6 rows, m) that span the motions of the whole scene, in the tangents of `sfm.bundle.system`.
 
-    A point x of the world moves by  ω × x + τ + σ x , a pose (R, t) by  −R ω  and  (R ω) × t − R τ + σ t .
+    A point X of the world moves by  a × X + b + c X , a frame with centre C turns by  −a  and shifts by
+    −(a × C + b + c C); parameters stay, and sensors shift on their rigs by  c t .
     """
-    poses, points = problem.cams_from_world, problem.points3D
-    R, t = poses.rotation.matrix, poses.translation
-    tangents = np.zeros((len(t), 6, 7))
-    tangents[:, :3, :3] = -R
-    tangents[:, 3:, :3] = -skew(t) @ R
-    tangents[:, 3:, 3:6] = -R
-    tangents[:, 3:, 6] = t
-    seen = np.bincount(layout.image, minlength=len(t)) > 0
+    centers, points, poses = frame_centers(problem), problem.points3D, len(layout.slot_frame)
+    tangents = np.zeros((len(centers), 6, 7))
+    tangents[:, :3, :3] = -np.eye(3)
+    tangents[:, 3:, :3] = skew(centers)
+    tangents[:, 3:, 3:6] = -np.eye(3)
+    tangents[:, 3:, 6] = -centers
+    seen = np.bincount(layout.image_frame[layout.image], minlength=len(centers)) > 0
     constant = np.unique(layout.point[~problem.free_points[layout.point]])
     fixed = np.concatenate([-skew(points[constant]), np.broadcast_to(np.eye(3), (len(constant), 3, 3)),
                             points[constant][:, :, None]], axis=2)  # fmt: skip
-    held = np.concatenate([tangents[seen & ~problem.free_poses].reshape(-1, 7), fixed.reshape(-1, 7)])
-    _, sizes, directions = np.linalg.svd(np.concatenate([held, np.zeros((7, 7))]))
+    shared = np.zeros((len(layout.shared), 6, 7))
+    forbidden = [tangents[seen & (layout.frame_slot < 0)].reshape(-1, 7), fixed.reshape(-1, 7), np.zeros((7, 7))]
+    if problem.rigs is not None:
+        mounted = layout.shared.sensor >= 0
+        lengths = problem.rigs.sensors_from_rig.translation
+        shared[mounted, 3:, 6] = lengths[layout.shared.sensor[mounted]]
+        unmoved = np.zeros((np.sum(~problem.rigs.free_sensors), 3, 7))
+        unmoved[:, :, 6] = lengths[~problem.rigs.free_sensors]
+        forbidden.append(unmoved.reshape(-1, 7))
+    _, sizes, directions = np.linalg.svd(np.concatenate(forbidden))
     allowed = directions[sizes <= 1e-9 * max(float(sizes.max()), 1e-300)].T
-    free = tangents[layout.slot_image].reshape(-1, 7) @ allowed
-    cameras = len(layout.slot_camera) * layout.columns.shape[1]
-    return np.concatenate([free, np.zeros((cameras, allowed.shape[1]))])
+    free = np.concatenate([tangents[layout.slot_frame], shared])
+    return free.reshape(-1, 7)[: 6 * (poses + len(shared))] @ allowed
 
 
-def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> FloatArray:
-    blocks = np.zeros((len(problem.image_cameras), 6, 6))
-    blocks[problem.free_poses] = np.nan
-    for slot, image in enumerate(layout.slot_image):
-        mine = slice(6 * slot, 6 * slot + 6)
-        blocks[image] = sigma[mine, mine]
+def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Covariances (I, 6, 6) of the poses' tangents on the left, and of the centres (I, 3, 3).
+
+    With the frame's tangent δ in world axes a camera moves by R [I, 0; −[c]×, I] δ, c from the frame's centre to its
+    own, plus what its sensor's tangent μ adds.
+    """
+    poses = problem.cams_from_world
+    blocks, centers = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 3, 3))
+    blocks[problem.free_poses], centers[problem.free_poses] = np.nan, np.nan
+    R, offsets = poses.rotation.matrix, poses.center - frame_centers(problem)[layout.image_frame]
+    seen = np.bincount(layout.image, minlength=len(poses)) > 0
+    mounts = _sensor_rows(layout)
+    for image in np.flatnonzero(seen):
+        rows, columns = [], []
+        if layout.image_slot[image] >= 0:
+            turn = np.zeros((6, 6))
+            turn[:3, :3] = turn[3:, 3:] = R[image]
+            turn[3:, :3] = -R[image] @ skew(offsets[image])
+            rows.append(layout.image_slot[image])
+            columns.append(turn)
+        for row in layout.image_shared[image]:
+            if row in mounts:
+                rows.append(row)
+                columns.append(np.eye(6))
+        if not rows:
+            blocks[image], centers[image] = 0.0, 0.0
+            continue
+        J = np.concatenate(columns, axis=1)
+        index = np.concatenate([np.arange(6 * row, 6 * row + 6) for row in rows])
+        blocks[image] = J @ sigma[np.ix_(index, index)] @ J.T
+        centers[image] = R[image].T @ blocks[image][3:, 3:] @ R[image]
+    return blocks, centers
+
+
+def _sensor_rows(layout: Layout) -> set[int]:
+    """Numbers of the rows that are tangents of sensors."""
+    return {len(layout.slot_frame) + int(k) for k in np.flatnonzero(layout.shared.sensor >= 0)}
+
+
+def _camera_blocks(layout: Layout, sigma: FloatArray, cameras: int) -> FloatArray:
+    blocks = np.zeros((cameras, MAX_PARAMS, MAX_PARAMS))
+    shared, first = layout.shared, len(layout.slot_frame)
+    for camera in np.unique(shared.camera[shared.camera >= 0]):
+        mine, place = np.nonzero((shared.columns >= 0) & (shared.camera == camera)[:, None])
+        columns, entries = shared.columns[mine, place], 6 * (first + mine) + place
+        blocks[camera][np.ix_(columns, columns)] = sigma[np.ix_(entries, entries)]
     return blocks
 
 
-def _camera_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> FloatArray:
-    blocks, width = np.zeros((len(problem.model_ids), MAX_PARAMS, MAX_PARAMS)), layout.columns.shape[1]
-    for slot, camera in enumerate(layout.slot_camera):
-        columns = layout.columns[camera][layout.columns[camera] >= 0]
-        first = 6 * len(layout.slot_image) + width * slot
-        mine = slice(first, first + len(columns))
-        blocks[camera][np.ix_(columns, columns)] = sigma[mine, mine]
-    return blocks
-
-
-def _undetermined(entry: int, layout: Layout) -> Rejected:
+def _undetermined(entry: int, problem: BundleProblem, layout: Layout) -> Rejected:
     """Whose parameter an entry of the reduced system is."""
-    poses = 6 * len(layout.slot_image)
-    if entry < poses:
-        return Rejected("undetermined_pose", str(layout.slot_image[entry // 6]))
-    return Rejected("undetermined_camera", str(layout.slot_camera[(entry - poses) // layout.columns.shape[1]]))
+    row = entry // 6
+    if row < len(layout.slot_frame):
+        image = np.flatnonzero(layout.image_frame == layout.slot_frame[row])[0]
+        return Rejected("undetermined_pose", str(image))
+    shared = row - len(layout.slot_frame)
+    if layout.shared.camera[shared] >= 0:
+        return Rejected("undetermined_camera", str(layout.shared.camera[shared]))
+    return Rejected("undetermined_sensor", str(layout.shared.sensor[shared]))

@@ -1,9 +1,9 @@
 """The seven motions of the whole scene that no observation sees, and how an adjustment holds them.
 
-Rotating, moving and scaling the world together with all cameras changes no residual. Holding the pose of one image
-takes six of the seven freedoms. Scaling about that image's centre then moves a second image along their baseline:
-holding the largest entry of υ along the baseline, in the frame of the second, takes the last. It is held in every
-step, not as a coordinate; the scale may thus creep within a run, which costs nothing.
+Rotating, moving and scaling the world together with all cameras changes no residual. Holding the pose of one frame
+takes six of the seven freedoms. Scaling about that frame's centre then moves a second one along their baseline:
+holding the coordinate of its centre in which this baseline is longest takes the last. Where a sensor sits on its rig at
+a known distance, the scale is seen and nothing of a second frame is held.
 """
 
 from __future__ import annotations
@@ -12,39 +12,56 @@ import numpy as np
 
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import BundleProblem
+from sfm.core.arrays import BoolArray, FloatArray
 
 
-def held_by_two_cameras(problem: BundleProblem, layout: Layout) -> np.ndarray:
+def held_by_two_cameras(problem: BundleProblem, layout: Layout) -> BoolArray:
     """(S, 6) tangent entries of the moving poses to hold; none where the constant parts fix the gauge already."""
-    held = np.zeros((len(layout.slot_image), 6), bool)
-    seen = np.bincount(layout.image, minlength=len(layout.pose_slot))
-    constant = np.flatnonzero(~problem.free_poses & (seen > 0))
+    held = np.zeros((len(layout.slot_frame), 6), bool)
+    frame = layout.image_frame[layout.image]
+    seen = np.bincount(frame, minlength=len(layout.frame_slot))
+    constant = np.flatnonzero((layout.frame_slot < 0) & (seen > 0))
     constant_points = np.unique(layout.point[~problem.free_points[layout.point]])
     if not len(held) or len(constant) >= 2 or len(constant_points) >= 3:
         return held
     anchor = int(constant[0]) if len(constant) else int(np.argmax(seen))
     if not len(constant):
-        held[layout.pose_slot[anchor]] = True
-    second = _second_image(problem, layout, anchor)
+        held[layout.frame_slot[anchor]] = True
+    second = None if _scale_is_seen(problem, layout) else _second_frame(problem, layout, frame, anchor)
     if second is not None:
-        image, axis = second
-        held[layout.pose_slot[image], 3 + axis] = True
+        chosen, axis = second
+        held[layout.frame_slot[chosen], 3 + axis] = True
     return held
 
 
-def _second_image(problem: BundleProblem, layout: Layout, anchor: int) -> tuple[int, int] | None:
-    """The moving image farthest from `anchor` among those that share many points with it, and the axis to hold."""
-    poses = problem.cams_from_world
+def frame_centers(problem: BundleProblem) -> FloatArray:
+    """(F, 3) the centres of the frames in the world."""
+    return (problem.cams_from_world if problem.rigs is None else problem.rigs.rigs_from_world).center
+
+
+def _scale_is_seen(problem: BundleProblem, layout: Layout) -> bool:
+    """Whether an observing sensor has a fixed place on its rig away from the rig's centre."""
+    if problem.rigs is None:
+        return False
+    sensors = problem.rigs.image_sensors[layout.image]
+    fixed = np.unique(sensors[sensors >= 0])
+    fixed = fixed[~problem.rigs.free_sensors[fixed]]
+    return bool(np.any(np.linalg.norm(problem.rigs.sensors_from_rig.center[fixed], axis=1) > 0))
+
+
+def _second_frame(problem: BundleProblem, layout: Layout, frame: np.ndarray, anchor: int) -> tuple[int, int] | None:
+    """The moving frame farthest from `anchor` among those that share many points with it, and the axis to hold."""
     with_anchor = np.zeros(len(problem.points3D), bool)
-    with_anchor[layout.point[layout.image == anchor]] = True
-    shared = np.bincount(layout.image[with_anchor[layout.point]], minlength=len(layout.pose_slot))
+    with_anchor[layout.point[frame == anchor]] = True
+    shared = np.bincount(frame[with_anchor[layout.point]], minlength=len(layout.frame_slot))
     shared[anchor] = 0
-    shared[layout.pose_slot < 0] = 0
+    shared[layout.frame_slot < 0] = 0
     if not shared.any():
         return None
-    baselines = np.einsum("iab,ib->ia", poses.rotation.matrix, poses.center[anchor] - poses.center)
+    centers = frame_centers(problem)
+    baselines = centers - centers[anchor]
     lengths = np.where(2 * shared >= shared.max(), np.linalg.norm(baselines, axis=1), -1.0)
-    image = int(np.argmax(lengths))
-    if not lengths[image] > 0:
+    chosen = int(np.argmax(lengths))
+    if not lengths[chosen] > 0:
         return None
-    return image, int(np.argmax(np.abs(baselines[image])))
+    return chosen, int(np.argmax(np.abs(baselines[chosen])))

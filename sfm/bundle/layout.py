@@ -1,9 +1,13 @@
 """The order in which kernels see a problem.
 
-Observations are sorted by point and, within a point, by the row (`slot`) of their pose in the normal equations;
-those of poses that do not move come first, with slot −1. A *coupling* is a point together with a camera that has free
-parameters and sees it. Free parameters of each camera are counted from the left into K columns, K the largest such
-number; cameras with fewer have padding, which the solver holds at zero.
+What is left after the elimination of points comes in rows of six (`sfm.core.optim.block_pattern`): first the poses of
+frames that may move, then *shared rows*: the free parameters of each camera, six to a row, and the poses of sensors
+that may move on their rig. A frame is what moves as one: the images of one moment of a rig, or a single image.
+
+Observations are kept in two orders. By images they are evaluated, many at once. By points, and within a point by the
+row (`slot`) of their frame, they are eliminated; those of frames that do not move come first there, with slot −1.
+A *coupling* is a point together with a row that its observations depend on; only points that may move couple to shared
+rows.
 """
 
 from __future__ import annotations
@@ -13,16 +17,33 @@ import itertools
 
 import numpy as np
 
+from sfm.bundle import _layout_kernels as kernels
 from sfm.bundle.problem import BundleProblem
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.execution import chunk_bounds
+from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
 _OBSERVATIONS_PER_CHUNK = 8192
 _MAX_CHUNKS = 16
-_JOBS = 8
-_PRODUCTS_PER_COPY = 8
-"""Products for each block of the reduced matrix from which a further copy of it pays: adding one costs about as much
-as a product."""
-_MAX_COPIES_BYTES = 1 << 26
+SENSOR_COLUMN = MAX_PARAMS
+"""Where the six columns of a sensor's tangent begin, behind those of the parameters."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class SharedRows:
+    """Rows behind those of poses, T of them.
+
+    Attributes:
+        camera, sensor: (T,) whose row it is, −1 for no camera or no sensor.
+        columns: (T, 6) index of the parameter in each place, −1 for padding; sensors have `SENSOR_COLUMN` and on.
+    """
+
+    camera: np.ndarray
+    sensor: np.ndarray
+    columns: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.camera)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -30,95 +51,157 @@ class Layout:
     """The sorted problem; see the module.
 
     Attributes:
-        offsets: (P + 1,) observations of each point; image, observed their columns.
-        pose_slot: (I,) row of the pose, −1 where it does not move; slot_image (S,) the inverse.
-        camera_slot, image_slot: (C,) and (I,) row of the camera; slot_camera (T,) the inverse.
-        columns: (C, K) index of the parameter in each column, −1 for padding.
-        starts: (P,) first observation of the point that has a slot, the end of its run where the point is fixed.
-        obs_slot, obs_coupling: (n,) rows of `pose_slot` and of couplings.
-        coupling_offsets, coupling_point, coupling_slot: couplings by point.
-        point_chunks: ranges of points with about the same number of observations.
-        copies: of the reduced system.
-        jobs, coupling_jobs: (copy, observations) and (copy, couplings) to eliminate, about the same work in each.
+        image_offsets: (I + 1,) observations of each image; image_point, observed, precision their columns in this
+            order, place (n,) where each stands in the order by points.
+        offsets: (P + 1,) observations of each point; image, obs_slot their columns in this order, source (n,) where
+            each stands in the order by images.
+        image_frame: (I,) and frame_slot (F,): the frame of each image and its row, −1 where it does not move;
+            slot_frame (S,) the inverse; image_slot (I,) the row of each image's frame.
+        shared: the rows behind those of poses; shared row k is row S + k.
+        image_shared: (I, m) the shared rows of each image as numbers of rows, ascending, −1 for none.
+        column_count, columns, column_place: (I,) how many free columns an image shares, (I, k) which, and where they
+            stand among the 6 m places of its shared rows.
+        starts, slot: couplings with poses by point (P + 1,), (E,).
+        shared_starts, shared_slot: those with shared rows, (P + 1,), (G,); obs_shared (n, m) that of an observation.
+        point_chunks, image_chunks: ranges of points and of images with about the same number of observations.
     """
 
-    offsets: np.ndarray
-    image: np.ndarray
-    point: np.ndarray
+    image_offsets: np.ndarray
+    image_point: np.ndarray
     observed: np.ndarray
     precision: np.ndarray
-    pose_slot: np.ndarray
-    slot_image: np.ndarray
-    image_slot: np.ndarray
-    slot_camera: np.ndarray
-    columns: np.ndarray
-    starts: np.ndarray
+    place: np.ndarray
+    offsets: np.ndarray
+    image: np.ndarray
     obs_slot: np.ndarray
-    obs_coupling: np.ndarray
-    coupling_offsets: np.ndarray
-    coupling_point: np.ndarray
-    coupling_slot: np.ndarray
+    source: np.ndarray
+    image_frame: np.ndarray
+    frame_slot: np.ndarray
+    slot_frame: np.ndarray
+    image_slot: np.ndarray
+    shared: SharedRows
+    image_shared: np.ndarray
+    column_count: np.ndarray
+    columns: np.ndarray
+    column_place: np.ndarray
+    starts: np.ndarray
+    slot: np.ndarray
+    shared_starts: np.ndarray
+    shared_slot: np.ndarray
+    obs_shared: np.ndarray
     point_chunks: list[tuple[int, int]]
-    copies: int
-    jobs: list[tuple[int, np.ndarray]]
-    coupling_jobs: list[tuple[int, np.ndarray]]
+    image_chunks: list[tuple[int, int]]
+
+    @property
+    def point(self) -> np.ndarray:
+        """(n,) the point of each observation in the order by points."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of six."""
+        return len(self.slot_frame) + len(self.shared)
+
+    @property
+    def padding(self) -> np.ndarray:
+        """(rows, 6) places that are no unknowns."""
+        return np.concatenate([np.zeros((len(self.slot_frame), BLOCK), bool), self.shared.columns < 0])
+
+    def pattern(self) -> BlockPattern:
+        """The blocks of S that points, images and shared rows fill."""
+        marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)
+        kernels.mark_pairs(self.starts, self.slot, self.shared_starts, self.shared_slot, marked)
+        for k in range(self.image_shared.shape[1]):
+            for other in (self.image_slot, *self.image_shared[:, :k].T):
+                both = (self.image_shared[:, k] >= 0) & (other >= 0)
+                kernels.mark(self.image_shared[both, k], other[both], marked)
+        return BlockPattern(*kernels.marked_blocks(marked))
+
+    def row_ranges(self, parts: int) -> list[tuple[int, int]]:
+        """Ranges of rows that take about the same work to eliminate."""
+        point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
+        work = np.bincount(self.slot, np.arange(len(self.slot)) - self.starts[point] + 2.0, self.rows)
+        point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.shared_starts))
+        before = np.arange(len(self.shared_slot)) - self.shared_starts[point] + np.diff(self.starts)[point]
+        work += np.bincount(self.shared_slot, before + 1.0, self.rows)
+        running = np.cumsum(work)
+        cuts = np.searchsorted(running, np.arange(1, parts) * (running[-1] / parts) if len(running) else [])
+        edges = [0, *(int(cut) + 1 for cut in cuts), self.rows]
+        return [(a, min(b, self.rows)) for a, b in itertools.pairwise(edges) if a < min(b, self.rows)]
 
 
 def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
-    """Sorts the observations of `problem` that are `active` (n,) and numbers its free blocks."""
+    """Sorts the observations of `problem` that are `active` (n,) and numbers its free rows."""
     images, points = len(problem.image_cameras), len(problem.points3D)
-    image, point = problem.obs_images[active], problem.obs_points[active].astype(np.int64)
-    seen = np.bincount(image, minlength=images) > 0
-    pose_slot, slot_image = _number(problem.free_poses & seen)
-    slots = pose_slot[image]
-    order = _sorting(point * (len(slot_image) + 1) + slots + 1)
-    image, point, slots = image[order], point[order], slots[order]
-    offsets = np.searchsorted(point, np.arange(points + 1))
+    image_frame, free_frames = _frames(problem)
+    by_point, _ = kernels.sort_rows(np.flatnonzero(active).astype(np.int32), problem.obs_points, points)
+    by_image, image_offsets = kernels.sort_rows(by_point, problem.obs_images, images)
+    seen = np.diff(image_offsets) > 0
+    frame_seen = np.bincount(image_frame[seen], minlength=len(free_frames)) > 0
+    frame_slot, slot_frame = _number(free_frames & frame_seen)
+    image_slot = frame_slot[image_frame]
+    by_slot = by_image
+    if np.any(image_slot[1:] < image_slot[:-1]):
+        by_slot, _ = kernels.sort_rows(by_image, image_slot[problem.obs_images] + 1, len(slot_frame) + 1)
+    by_point, offsets = kernels.sort_rows(by_slot, problem.obs_points, points)
+    image = problem.obs_images[by_point]
+    point, slots = np.repeat(np.arange(points), np.diff(offsets)), image_slot[image]
+    place, source = _from_one_order_to_another(by_image, by_point, len(active))
 
-    camera_seen = np.bincount(problem.image_cameras[seen], minlength=len(problem.model_ids)) > 0
-    camera_slot, slot_camera = _number(problem.free_params.any(axis=1) & camera_seen)
-    image_slot = camera_slot[problem.image_cameras]
-    coupling, coupling_point, coupling_slot = _couplings(
-        point, image_slot[image], problem.free_points, len(slot_camera)
+    shared = _shared_rows(problem, seen)
+    image_shared = _rows_of_images(problem, shared, len(slot_frame))
+    columns, column_place, column_count = _columns(shared, image_shared - len(slot_frame))
+    obs_shared, shared_point, shared_slot = _shared_couplings(
+        point, image_shared[image], problem.free_points, len(slot_frame) + len(shared)
     )
-    coupling_offsets = np.searchsorted(coupling_point, np.arange(points + 1))
-
-    starts = offsets[:-1] + np.bincount(point, weights=slots < 0, minlength=points).astype(np.int64)
-    starts = np.where(problem.free_points, starts, offsets[1:])
-    eliminated = np.flatnonzero((slots >= 0) & problem.free_points[point])
-    work = eliminated - starts[point[eliminated]] + 1
-    coupled = np.arange(len(coupling_point))
-    coupling_work = coupled - coupling_offsets[coupling_point] + 1
+    moves = np.flatnonzero((slots >= 0) & _changes(point, slots))
     chunks = int(np.clip(len(point) // _OBSERVATIONS_PER_CHUNK, 1, _MAX_CHUNKS))
-    columns = _columns(np.where(camera_seen[:, None], problem.free_params, False))
-    copies, stripes = _sharing(int(work.sum()), len(slot_image), columns.shape[1] * len(slot_camera), chunks)
     return Layout(
+        image_offsets=image_offsets,
+        image_point=problem.obs_points[by_image],
+        observed=problem.obs_points2D[by_image],
+        precision=np.ones(len(by_image)) if problem.obs_sigmas is None else 1 / problem.obs_sigmas[by_image],
+        place=place,
         offsets=offsets,
         image=image,
-        point=point.astype(np.int32),
-        observed=problem.obs_points2D[active][order],
-        precision=_precision(problem, active)[order],
-        pose_slot=pose_slot,
-        slot_image=slot_image,
-        image_slot=image_slot,
-        slot_camera=slot_camera,
-        columns=columns,
-        starts=starts,
         obs_slot=slots,
-        obs_coupling=coupling,
-        coupling_offsets=coupling_offsets,
-        coupling_point=coupling_point,
-        coupling_slot=coupling_slot,
-        point_chunks=_point_chunks(offsets, chunks),
-        copies=copies,
-        jobs=_jobs(eliminated, slots[eliminated], work, copies, stripes),
-        coupling_jobs=_jobs(coupled, coupling_slot, coupling_work, copies, stripes),
+        source=source,
+        image_frame=image_frame,
+        frame_slot=frame_slot,
+        slot_frame=slot_frame,
+        image_slot=image_slot,
+        shared=shared,
+        image_shared=image_shared,
+        column_count=column_count,
+        columns=columns,
+        column_place=column_place,
+        starts=np.searchsorted(point[moves], np.arange(points + 1)),
+        slot=slots[moves],
+        shared_starts=np.searchsorted(shared_point, np.arange(points + 1)),
+        shared_slot=shared_slot,
+        obs_shared=obs_shared,
+        point_chunks=_even_ranges(offsets, chunks),
+        image_chunks=_even_ranges(image_offsets, chunks),
     )
 
 
-def _precision(problem: BundleProblem, active: np.ndarray) -> np.ndarray:
-    """1 / σ of the active observations."""
-    return np.ones(int(active.sum())) if problem.obs_sigmas is None else 1 / problem.obs_sigmas[active]
+def _from_one_order_to_another(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where the rows of one order (of some of `count` rows) stand in another, and the inverse."""
+    position = np.empty(count, np.int32)
+    position[second] = np.arange(len(second), dtype=np.int32)
+    place = position[first]
+    source = np.empty_like(place)
+    source[place] = np.arange(len(place), dtype=np.int32)
+    return place, source
+
+
+def _frames(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
+    """The frame of each image (I,), and which frames (F,) may move: those all of whose images may."""
+    if problem.rigs is None:
+        return np.arange(len(problem.image_cameras), dtype=np.int32), problem.free_poses
+    frames = problem.rigs.image_frames
+    count = len(problem.rigs.rigs_from_world)
+    return frames, np.bincount(frames[~problem.free_poses], minlength=count) == 0
 
 
 def _number(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,63 +212,80 @@ def _number(used: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return numbers, rows
 
 
-def _sorting(keys: np.ndarray) -> np.ndarray | slice:
-    """A stable order of the keys; nothing to do where they are sorted already."""
-    return slice(None) if np.all(keys[:-1] <= keys[1:]) else np.argsort(keys, kind="stable")
+def _changes(point: np.ndarray, slots: np.ndarray) -> np.ndarray:
+    """Where a new coupling begins."""
+    first = np.ones(len(point), bool)
+    first[1:] = (point[1:] != point[:-1]) | (slots[1:] != slots[:-1])
+    return first
 
 
-def _couplings(
-    point: np.ndarray, slot: np.ndarray, free_points: np.ndarray, cameras: int
+def _shared_rows(problem: BundleProblem, seen: np.ndarray) -> SharedRows:
+    """Rows for the cameras and sensors that have something free and that an observation sees."""
+    used = np.bincount(problem.image_cameras[seen], minlength=len(problem.model_ids)) > 0
+    camera, sensor, columns = [], [], []
+    for c in np.flatnonzero(used & problem.free_params.any(axis=1)):
+        free = np.flatnonzero(problem.free_params[c])
+        for k in range(0, len(free), BLOCK):
+            camera.append(c)
+            sensor.append(-1)
+            columns.append(np.pad(free[k : k + BLOCK], (0, max(k + BLOCK - len(free), 0)), constant_values=-1))
+    if problem.rigs is not None:
+        mounted = problem.rigs.image_sensors[seen]
+        used = np.bincount(mounted[mounted >= 0], minlength=len(problem.rigs.free_sensors)) > 0
+        for q in np.flatnonzero(used & problem.rigs.free_sensors):
+            camera.append(-1)
+            sensor.append(q)
+            columns.append(SENSOR_COLUMN + np.arange(BLOCK))
+    return SharedRows(
+        np.array(camera, np.int32), np.array(sensor, np.int32), np.array(columns, np.int32).reshape(-1, BLOCK)
+    )
+
+
+def _rows_of_images(problem: BundleProblem, shared: SharedRows, poses: int) -> np.ndarray:
+    """(I, m) the numbers of the shared rows of each image, ascending, −1 for none."""
+    owned: list[list[int]] = [[] for _ in problem.model_ids]
+    mounted: list[list[int]] = [[] for _ in (problem.rigs.free_sensors if problem.rigs else [])]
+    for k, (c, q) in enumerate(zip(shared.camera, shared.sensor, strict=True)):
+        (owned[c] if c >= 0 else mounted[q]).append(poses + k)
+    sensors = problem.rigs.image_sensors if problem.rigs else np.full(len(problem.image_cameras), -1)
+    rows = [owned[c] + (mounted[q] if q >= 0 else []) for c, q in zip(problem.image_cameras, sensors, strict=True)]
+    out = np.full((len(rows), max(map(len, rows), default=0)), -1, np.int32)
+    for i, mine in enumerate(rows):
+        out[i, : len(mine)] = mine
+    return out
+
+
+def _columns(shared: SharedRows, image_shared: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Free columns of each image and their places among those of its shared rows (I, k), and their count (I,)."""
+    padded = np.concatenate([shared.columns, np.full((1, BLOCK), -1, np.int32)])
+    size = image_shared.shape[1] * BLOCK
+    everything = padded[np.where(image_shared >= 0, image_shared, -1)].reshape(len(image_shared), size)
+    place = np.argsort(everything < 0, axis=1, kind="stable").astype(np.int32)
+    count = np.sum(everything >= 0, axis=1).astype(np.int32)
+    place = np.ascontiguousarray(place[:, : int(count.max(initial=0))])
+    return np.take_along_axis(everything, place, axis=1), place, count
+
+
+def _shared_couplings(
+    point: np.ndarray, rows: np.ndarray, free_points: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The coupling of each observation (−1 for none), and point and camera slot of each coupling."""
-    coupling = np.full(len(point), -1, np.int32)
-    takes_part = (slot >= 0) & free_points[point]
-    keys = point[takes_part] * max(cameras, 1) + slot[takes_part]
-    unique, inverse = np.unique(keys, return_inverse=True)
+    """The couplings of each observation (n, m), −1 for none, and point and row of each coupling."""
+    coupling = np.full(rows.shape, -1, np.int32)
+    takes_part = (rows >= 0) & free_points[point][:, None]
+    keys = (point.astype(np.int64)[:, None] * max(count, 1) + rows)[takes_part]
+    if len(keys) and np.all(keys[:-1] <= keys[1:]):
+        first = np.ones(len(keys), bool)
+        first[1:] = keys[1:] != keys[:-1]
+        unique, inverse = keys[first], np.cumsum(first) - 1
+    else:
+        unique, inverse = np.unique(keys, return_inverse=True)
     coupling[takes_part] = inverse
-    return coupling, (unique // max(cameras, 1)).astype(np.int32), (unique % max(cameras, 1)).astype(np.int32)
+    return coupling, unique // max(count, 1), (unique % max(count, 1)).astype(np.int32)
 
 
-def _columns(free: np.ndarray) -> np.ndarray:
-    """(C, K) indices of the free parameters, padded with −1."""
-    counts = free.sum(axis=1)
-    columns = np.full((len(free), int(counts.max(initial=0))), -1, np.int32)
-    rows, indices = np.nonzero(free)
-    columns[rows, np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)] = indices
-    return columns
-
-
-def _point_chunks(offsets: np.ndarray, chunks: int) -> list[tuple[int, int]]:
-    """Ranges of points, cut where the observations are shared out evenly."""
-    points = len(offsets) - 1
+def _even_ranges(offsets: np.ndarray, chunks: int) -> list[tuple[int, int]]:
+    """Ranges of points or images, cut where the observations are shared out evenly."""
+    count = len(offsets) - 1
     cuts = [int(np.searchsorted(offsets, last)) for _, last in chunk_bounds(int(offsets[-1]), chunks)]
-    edges = [0, *cuts[:-1], points]
-    return [(a, b) for a, b in itertools.pairwise(edges) if a < b] or [(0, points)]
-
-
-def _sharing(products: int, poses: int, shared: int, chunks: int) -> tuple[int, int]:
-    """Copies of the reduced system, and ranges of rows in each."""
-    jobs = min(chunks, _JOBS)
-    numbers = 18 * poses * (poses + 1) + 6 * poses * shared + shared**2
-    worthwhile = 36 * products // (_PRODUCTS_PER_COPY * max(numbers, 1))
-    affordable = _MAX_COPIES_BYTES // (8 * max(numbers, 1))
-    copies = min(worthwhile, affordable, jobs)
-    return (copies, 1) if copies > jobs // 2 else (1, jobs)
-
-
-def _jobs(
-    items: np.ndarray, rows: np.ndarray, work: np.ndarray, copies: int, stripes: int
-) -> list[tuple[int, np.ndarray]]:
-    """Cuts `items`, sorted by point, by points into `copies` parts or by rows into `stripes`."""
-    if not len(items):
-        return []
-    if stripes == 1:
-        part = _shares(np.cumsum(work), copies)
-        return [(k, mine) for k in range(copies) if len(mine := items[part == k])]
-    part = _shares(np.cumsum(np.bincount(rows, weights=work)), stripes)[rows]
-    return [(0, mine) for k in range(stripes) if len(mine := items[part == k])]
-
-
-def _shares(running: np.ndarray, parts: int) -> np.ndarray:
-    """Which of `parts` equal shares of the last running sum each entry falls into."""
-    return np.minimum((running - running[0] / 2) * parts // max(running[-1], 1), parts - 1).astype(np.int8)
+    edges = [0, *cuts[:-1], count]
+    return [(a, b) for a, b in itertools.pairwise(edges) if a < b] or [(0, count)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
@@ -11,8 +11,51 @@ from jaxtyping import Bool, Float64, Int32
 from sfm.core.arrays import Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
 from sfm.core.optim.losses import Loss
+
+SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "iterative"]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigArrays(Value):
+    """Images that were taken at one moment by sensors mounted together, and how these are mounted.
+
+    Attributes:
+        image_frames: (I,) the row of the moment of each image.
+        image_sensors: (I,) the row of the sensor that took it, −1 for the rig's reference.
+        rigs_from_world: batch (F,), the pose of the rig at each moment.
+        sensors_from_rig: batch (Q,).
+        free_sensors: (Q,) which sensors may move on their rig.
+
+    Raises:
+        ValueError: shapes disagree or a row does not exist.
+    """
+
+    image_frames: Int32[np.ndarray, " I"]
+    image_sensors: Int32[np.ndarray, " I"]
+    rigs_from_world: Rigid3
+    sensors_from_rig: Rigid3
+    free_sensors: Bool[np.ndarray, " Q"]
+
+    def __post_init__(self) -> None:
+        images, sensors = len(self.image_frames), len(self.free_sensors)
+        object.__setattr__(self, "image_frames", readonly(self.image_frames, (images,), np.int32))
+        object.__setattr__(self, "image_sensors", readonly(self.image_sensors, (images,), np.int32))
+        object.__setattr__(self, "free_sensors", readonly(self.free_sensors, (sensors,), np.bool_))
+        if self.sensors_from_rig.shape != (sensors,) or len(self.rigs_from_world.shape) != 1:
+            raise ValueError(f"{self.sensors_from_rig.shape} poses for {sensors} sensors")
+        _check_rows("image_frames", self.image_frames, self.rigs_from_world.shape[0])
+        _check_rows("image_sensors", self.image_sensors + 1, sensors + 1)
+
+    @property
+    def cams_from_world(self) -> Rigid3:
+        """Poses (I,) of the images."""
+        mounted = self.sensors_from_rig
+        turns = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], mounted.rotation.wxyz])
+        mounts = Rigid3(Rotation3(turns), np.concatenate([np.zeros((1, 3)), mounted.translation]))
+        return mounts[self.image_sensors + 1] @ self.rigs_from_world[self.image_frames]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +76,8 @@ class BundleProblem(Value):
             for all.
         prior_params, prior_sigmas: (C, 12) what free camera parameters are expected to be, and the standard deviation
             of that; inf expects nothing, and so does None for all.
+        rigs: where images were taken together; `cams_from_world` must be that of the rigs then, and a rig moves where
+            all of its images may. None lets every image move by itself.
 
     Raises:
         ValueError: shapes disagree, a row does not exist, a parameter that the model lacks is free, or a standard
@@ -53,6 +98,7 @@ class BundleProblem(Value):
     prior_params: Float64[np.ndarray, "C K"] | None = None
     prior_sigmas: Float64[np.ndarray, "C K"] | None = None
     obs_sigmas: Float64[np.ndarray, " n"] | None = None
+    rigs: RigArrays | None = None
 
     def __post_init__(self) -> None:
         cameras, images = len(self.model_ids), len(self.image_cameras)
@@ -83,9 +129,18 @@ class BundleProblem(Value):
                 raise ValueError("obs_sigmas must be positive and finite")
         if self.cams_from_world.shape != (images,):
             raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
+        if self.rigs is not None:
+            self._check_rigs(self.rigs)
         _check_rows("image_cameras", self.image_cameras, cameras)
         _check_rows("obs_images", self.obs_images, images)
         _check_rows("obs_points", self.obs_points, points)
+
+    def _check_rigs(self, rigs: RigArrays) -> None:
+        if len(rigs.image_frames) != len(self.image_cameras):
+            raise ValueError(f"rigs of {len(rigs.image_frames)} images for {len(self.image_cameras)}")
+        ours, theirs = self.cams_from_world, rigs.cams_from_world
+        if not np.allclose(ours.matrix, theirs.matrix, rtol=1e-6, atol=1e-6, equal_nan=True):
+            raise ValueError("cams_from_world must be the poses of the rigs' sensors")
 
 
 def _check_rows(name: str, rows: np.ndarray, count: int) -> None:
@@ -112,12 +167,16 @@ class BundleConfig:
     """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
     gauge: Literal["two_cameras", "free"] = "two_cameras"
     """Hold one pose and one direction of motion of a second where the data leave them open, or hold nothing."""
+    solver: SolverChoice = "auto"
+    """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
         if not self.loss_scale_px > 0:
             raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        if self.solver not in get_args(SolverChoice):
+            raise ValueError(f"solver must be one of {', '.join(get_args(SolverChoice))}, got {self.solver!r}")
         if self.gauge not in ("two_cameras", "free"):
             raise ValueError(f"gauge must be two_cameras or free, got {self.gauge!r}")
 

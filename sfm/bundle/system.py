@@ -1,11 +1,15 @@
 """The normal equations of a reprojection problem, for the damping loop.
 
 A point X seen by an image with pose (R, t) lies at x = R X + t in the camera and is projected to π(x, θ), θ the
-parameters of the camera. With A = ∂π/∂x, Q = ∂π/∂θ, and poses moved on the left by exp(ω, υ):
+parameters of the camera. What moves as one, an image or the images of one moment of a rig, is a frame with a centre C.
+It turns and shifts by δ = (ω, υ) in the axes of the world, R ← R exp(ω) and C ← C − υ, so that against it a point moves
+by ω × (X − C) + υ: the same three columns serve pose and point, and coordinates far from the origin do no harm. With
+A = ∂π/∂x, Q = ∂π/∂θ:
 
-    r = π(x, θ) − observed        ∂r/∂(ω, υ) = A [−[x]×, I]        ∂r/∂θ = Q        ∂r/∂X = A R
+    r = π(x, θ) − observed     ∂r/∂X = A R = P     ∂r/∂δ = P [−[X − C]×, I]     ∂r/∂θ = Q     ∂r/∂μ = A [−[x]×, I]
 
-Rows are scaled by √ρ'(|r|²), see `sfm.core.optim.losses`; how points are eliminated is in `sfm.core.optim.schur`.
+with μ the tangent of a sensor's pose on its rig, on the left and in its own axes. Rows are scaled by √ρ'(|r|²), see
+`sfm.core.optim.losses`; how points are eliminated is in `sfm.core.optim.schur`, in which order in `layout`.
 A camera parameter that is expected to be θ₀ with standard deviation σ adds ½ ((θ − θ₀) / σ)².
 Points are cut into chunks whose number depends on the problem alone and whose sums are added in order.
 """
@@ -19,18 +23,18 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from sfm.bundle import _kernels as kernels
-from sfm.bundle.layout import Layout
-from sfm.bundle.problem import BundleConfig, BundleProblem
+from sfm.bundle.layout import SENSOR_COLUMN, Layout
+from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
+from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import ordered_map
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
+from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial
 from sfm.core.optim.losses import loss_id
-from sfm.core.optim.schur import ReducedSystem, eliminate_border, eliminate_poses, invert_blocks, solve_reduced
+from sfm.core.optim.schur import Couplings, invert_blocks
 
-_FLOOR = 1e-8
-"""Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
 
@@ -47,40 +51,33 @@ class BundleSystem:
         self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, lost_cost: float,
         threads: int,
     ) -> None:  # fmt: skip
-        self.layout, self._threads = layout, threads
+        self.layout, self._threads, self._rigs = layout, threads, problem.rigs
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
-        self._free_points = problem.free_points.copy()
+        self.free_points = problem.free_points.copy()
         self._loss = (loss_id(config.loss), float(config.loss_scale_px), float(lost_cost))
-        poses = problem.cams_from_world
-        self._state = _State(
-            poses.rotation.wxyz.copy(),
-            poses.translation.copy(),
-            poses.rotation.matrix,
-            problem.camera_params.copy(),
-            problem.points3D.copy(),
-        )
+        self._state = _State.of(problem)
         self._trial = self._state.copy()
 
-        images, points, observations = len(self._image_cameras), len(problem.points3D), len(layout.image)
-        chunks, K = len(layout.point_chunks), layout.columns.shape[1]
-        self._pose_count = 6 * len(layout.slot_image)
-        slots = np.arange(len(layout.slot_image))
-        self._diagonal_blocks = slots * (slots + 3) // 2
-        self.held = np.concatenate([held.ravel(), (layout.columns[layout.slot_camera] < 0).ravel()])
-        self._H, self._F = np.empty((chunks, images, 6, 6)), np.empty((chunks, images, K, 6 + K))
-        self._h = np.empty((chunks, images, 6 + K))
+        images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
+        self.held = layout.padding
+        self.held[: len(held)] |= held
+        self._images = ImageSums.allocate(images, widest)
+        self._of_observations = np.empty((len(layout.image), 9 + 3 * widest))
+        self._costs = np.empty(len(layout.image))
         self._V, self._g, self._M = np.empty((points, 6)), np.empty((points, 3)), np.empty((points, 6))
-        self._W, self._B = np.empty((observations, 3, 6)), np.empty((len(layout.coupling_point), 3, K))
-        self._reduced = ReducedSystem.allocate(len(layout.slot_image), len(layout.slot_camera) * K, layout.copies)
-        self._gradient = self._diagonal = np.empty(0)
-        columns = layout.columns[layout.slot_camera]
-        self._expected, self._prior_weight = _priors(problem, layout.slot_camera, columns)
+        self._couplings = Couplings(
+            layout.starts, layout.slot, np.empty((len(layout.slot), 6)),
+            layout.shared_starts, layout.shared_slot, np.empty((len(layout.shared_slot), 3, BLOCK)),
+        )  # fmt: skip
+        plan = plan_solver(layout, self.held, config.solver)
+        self._reduced = ReducedSystem(layout, self.held, self._couplings, plan, threads)
+        self._expected, self._prior_weight = _priors(problem, layout)
 
     @property
     def free_count(self) -> int:
         """Number of scalars that may change and that an observation sees."""
         seen = np.diff(self.layout.offsets) > 0
-        return int(np.sum(~self.held)) + 3 * int(np.sum(self._free_points & seen))
+        return int(np.sum(~self.held)) + 3 * int(np.sum(self.free_points & seen))
 
     @property
     def prior_count(self) -> int:
@@ -99,8 +96,26 @@ class BundleSystem:
 
     @property
     def cams_from_world(self) -> Rigid3:
-        """Current poses, a batch (I,)."""
-        return Rigid3(Rotation3(self._state.wxyz), self._state.translations)
+        """Current poses of the images, a batch (I,)."""
+        return self._state.images[2]
+
+    @property
+    def rigs(self) -> RigArrays | None:
+        """Current rigs, where there are any."""
+        now = self._state
+        if self._rigs is None:
+            return None
+        return dataclasses.replace(self._rigs, rigs_from_world=now.frames, sensors_from_rig=now.sensors)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(rows, 6) of the cost by what is left after the elimination, as last linearised; 0 where held."""
+        return self._reduced.gradient
+
+    @property
+    def plan(self) -> SolverPlan:
+        """How the reduced system is solved."""
+        return self._reduced.plan
 
     @property
     def lost(self) -> int:
@@ -109,66 +124,73 @@ class BundleSystem:
 
     def linearize(self) -> tuple[float, float]:
         """Cost and largest entry of the gradient at the current parameters."""
-        lay, now = self.layout, self._state
-        for sums in (self._H, self._F, self._h, self._B):
-            sums.fill(0)
+        lay, now, links = self.layout, self._state, self._couplings
+        sums = self._images
+        sums.clear()
+        links.B.fill(0)
+        rotations, translations, _ = now.images
+        centers, limits = now.centers[lay.slot_frame], kernels.squared_limits(self._model_ids, now.params)
 
-        def chunk(job: tuple[int, tuple[int, int]]) -> float:
-            k, (first, last) = job
-            return kernels.linearize(
-                first, last, lay.offsets, lay.image, lay.observed, lay.precision, lay.obs_coupling, self._free_points,
-                self._image_cameras, self._model_ids, lay.columns, lay.pose_slot,
-                now.rotations, now.translations, now.params, now.points3D, *self._loss,
-                self._H[k], self._F[k], self._h[k], self._V, self._g, self._W, self._B,
+        def images(job: tuple[int, int]) -> float:
+            return kernels.linearize_images(
+                *job, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
+                self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
+                rotations, translations, centers, now.params, now.points3D, *self._loss,
+                self._of_observations, sums.h, sums.F, sums.G, sums.f,
             )  # fmt: skip
 
-        cost = sum(self._run(chunk, list(enumerate(lay.point_chunks)))) + self._prior_cost(now.params)
-        self._images = _total(self._H), _total(self._F), _total(self._h)
-        self._add_images()
-        self._gradient = np.where(self.held, 0.0, -self._reduced.side())
-        self._diagonal = self._marquardt_diagonal()
-        largest = max(np.abs(self._gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
+        def points(job: tuple[int, int]) -> None:
+            kernels.gather_points(
+                *job, lay.offsets, lay.obs_slot, lay.column_count, lay.column_place, lay.image, lay.obs_shared,
+                links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
+            )  # fmt: skip
+
+        cost = sum(self._run(images, lay.image_chunks)) + self._prior_cost(now.params)
+        self._run(points, lay.point_chunks)
+        weight = self._prior_weight
+        self._reduced.take_over(sums, weight, weight * self._unexpected(now.params))
+        largest = max(np.abs(self._reduced.gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
         return float(cost), float(largest)
 
-    def information(self) -> tuple[FloatArray, Eliminated]:
-        """The reduced matrix S (N, N) without damping, and what is known of the points, as last linearised."""
-        self._add_images()
+    def information(self) -> Information:
+        """What the problem says about its parameters, as last linearised."""
         self._eliminate(0.0)
-        lower = np.tril(self._reduced.matrix())
-        return lower + np.tril(lower, -1).T, Eliminated(self._W, self._B, self._V, self._M)
+        centers = self._state.centers[self.layout.slot_frame]
+        return Information(self._reduced.matrix(), self._couplings, centers, self._V, self._M)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
-        self._add_images()
         self._eliminate(damping)
-        delta = solve_reduced(self._reduced, damping * self._diagonal, self.held)
+        delta = self._reduced.solve(damping)
         if delta is None:
             return None
         lay, now, then = self.layout, self._state, self._trial
-        pose_delta, camera_delta = delta[: self._pose_count].reshape(-1, 6), delta[self._pose_count :]
-        kernels.move_poses(
-            lay.slot_image, pose_delta, now.wxyz, now.translations, then.wxyz, then.translations, then.rotations
-        )
-        self._move_params(camera_delta)
-        totals = np.zeros((len(lay.point_chunks), 5))
+        now.move(delta, lay, then)
+        centers, totals = now.centers[lay.slot_frame], np.zeros((len(lay.point_chunks), 5))
+        rotations, translations, _ = then.images
 
-        def chunk(job: tuple[int, tuple[int, int]]) -> None:
-            k, (first, last) = job
-            kernels.try_points(
-                first, last, lay.offsets, lay.image, lay.observed, lay.precision, lay.starts, lay.obs_slot,
-                lay.coupling_offsets, lay.coupling_slot, self._image_cameras, self._model_ids,
-                then.rotations, then.translations, then.params, now.points3D, *self._loss,
-                damping, self._M, self._V, self._g, self._W, self._B, pose_delta, camera_delta,
-                then.points3D, totals[k],
+        def move(job: tuple[int, int]) -> None:
+            kernels.move_points(
+                *job, *self._couplings, centers, now.points3D, self._M, self._g, delta, then.points3D
             )  # fmt: skip
 
-        self._run(chunk, list(enumerate(lay.point_chunks)))
+        def settle(job: tuple[int, tuple[int, int]]) -> None:
+            k, points = job
+            kernels.settle_points(
+                *points, lay.offsets, lay.source, lay.image, lay.observed, lay.precision, self._image_cameras,
+                self._model_ids, rotations, translations, then.params, now.points3D, *self._loss,
+                damping, self._V, self._g, self._costs, then.points3D, totals[k],
+            )  # fmt: skip
+
+        self._run(move, lay.point_chunks)
+        self._evaluate(then)
+        self._run(settle, list(enumerate(lay.point_chunks)))
         cost, decrease, step, norm, lost = totals.sum(axis=0)
         cost += self._prior_cost(then.params)
         then.lost = int(lost)
-        decrease += 0.5 * (damping * self._diagonal @ delta**2 - self._gradient @ delta)
-        norm += np.sum(now.translations**2) + len(now.wxyz) + np.sum(now.params**2)
-        return Trial(float(cost), float(decrease), float(np.sqrt(step + delta @ delta)), float(np.sqrt(norm)))
+        decrease += 0.5 * float(np.sum(self._reduced.scaling * delta**2 - self._reduced.gradient * delta))
+        norm += np.sum(centers**2) + len(centers) + np.sum(now.params**2)
+        return Trial(float(cost), float(decrease), float(np.sqrt(step + np.sum(delta**2))), float(np.sqrt(norm)))
 
     def accept(self) -> None:
         """Makes the last trial current."""
@@ -177,115 +199,139 @@ class BundleSystem:
     def _run(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
         return list(ordered_map(function, jobs, threads=self._threads if len(jobs) > 1 else 1))
 
-    def _add_images(self) -> None:
-        """The reduced system before elimination: what images contribute on their own."""
-        reduced, lay = self._reduced, self.layout
-        H, F, h = self._images
-        reduced.clear()
-        reduced.blocks[0, self._diagonal_blocks] = H[lay.slot_image]
-        reduced.pose_side[0] = -h[lay.slot_image, :6]
-        cameras, K = len(lay.slot_camera), lay.columns.shape[1]
-        if not cameras:
-            return
-        images = np.flatnonzero(lay.image_slot >= 0)
-        moving = images[lay.pose_slot[images] >= 0]
-        border = reduced.border[0].reshape(-1, cameras, K, 6)
-        border[lay.pose_slot[moving], lay.image_slot[moving]] = F[moving, :, :6]
-        corner, rows = np.zeros((cameras, K, K)), np.arange(cameras)
-        np.add.at(corner, lay.image_slot[images], F[images, :, 6:])
-        reduced.corner[0].reshape(cameras, K, cameras, K)[rows, :, rows] = corner
-        np.add.at(reduced.corner_side[0].reshape(cameras, K), lay.image_slot[images], -h[images, 6:])
-        diagonal = np.arange(cameras * K)
-        reduced.corner[0][diagonal, diagonal] += self._prior_weight.ravel()
-        reduced.corner_side[0] -= (self._prior_weight * self._unexpected(self._state.params)).ravel()
+    def _evaluate(self, state: _State) -> None:
+        """Fills the costs of all observations, NaN where there is no projection."""
+        lay, limits = self.layout, kernels.squared_limits(self._model_ids, state.params)
+        rotations, translations, _ = state.images
+
+        def images(job: tuple[int, int]) -> None:
+            kernels.costs_of_images(
+                *job, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision,
+                self._image_cameras, self._model_ids, limits, rotations, translations, state.params,
+                state.points3D, *self._loss[:2], self._costs,
+            )  # fmt: skip
+
+        self._run(images, lay.image_chunks)
 
     def _unexpected(self, params: FloatArray) -> FloatArray:
-        """θ − θ₀ (S, K) of the free camera parameters that have a prior, 0 for the others."""
-        lay = self.layout
-        index = np.maximum(lay.columns[lay.slot_camera], 0)
-        values = np.take_along_axis(params[lay.slot_camera], index, axis=1)
-        return np.where(self._prior_weight > 0, values - self._expected, 0.0)
+        """θ − θ₀ (T, 6) of the free camera parameters that have a prior, 0 for the others."""
+        return np.where(self._prior_weight > 0, _values(params, self.layout) - self._expected, 0.0)
 
     def _prior_cost(self, params: FloatArray) -> float:
         return 0.5 * float(np.sum(self._prior_weight * self._unexpected(params) ** 2))
 
     def _eliminate(self, damping: float) -> None:
-        reduced, lay = self._reduced, self.layout
-        invert_blocks(0, len(self._V), self._V, damping, self._M)
-
-        def poses(job: tuple[int, np.ndarray]) -> None:
-            k, order = job
-            eliminate_poses(
-                order, lay.starts, lay.point, lay.obs_slot, self._W, self._M, self._g,
-                lay.coupling_offsets, lay.coupling_slot, self._B,
-                reduced.blocks[k], reduced.border[k], reduced.pose_side[k],
-            )  # fmt: skip
-
-        def shared(job: tuple[int, np.ndarray]) -> None:
-            k, order = job
-            eliminate_border(
-                order, lay.coupling_offsets, lay.coupling_point, lay.coupling_slot, self._B, self._M, self._g,
-                reduced.corner[k], reduced.corner_side[k],
-            )  # fmt: skip
-
-        self._run(poses, lay.jobs)
-        self._run(shared, lay.coupling_jobs)
-
-    def _marquardt_diagonal(self) -> FloatArray:
-        """The diagonal of the normal matrix; tiny entries are raised to a part of the largest of their kind."""
-        parts = (
-            np.einsum("iaa->ia", self._reduced.blocks[0, self._diagonal_blocks]),
-            np.diagonal(self._reduced.corner[0]).reshape(-1, max(self.layout.columns.shape[1], 1)),
-        )
-        raised = []
-        for part in parts:
-            largest = part.max(axis=0, initial=0.0)
-            raised.append(np.maximum(part, np.where(largest > 0, _FLOOR * largest, 1.0)).ravel())
-        return np.concatenate(raised)
-
-    def _move_params(self, delta: FloatArray) -> None:
-        lay = self.layout
-        columns = lay.columns[lay.slot_camera]
-        rows, k = np.nonzero(columns >= 0)
-        cells = lay.slot_camera[rows], columns[rows, k]
-        self._trial.params[cells] = self._state.params[cells] + delta.reshape(columns.shape)[rows, k]
+        """Inverts the blocks of points and takes them out of the reduced system."""
+        now = self._state
+        self._run(lambda job: invert_blocks(*job, self._V, damping, self._M), self.layout.point_chunks)
+        self._reduced.eliminate(now.centers[self.layout.slot_frame], now.points3D, self._M, self._g)
 
 
-class Eliminated(NamedTuple):
-    """Of the points: couplings with poses (n, 3, 6) and cameras (E, 3, K), information and its inverse (P, 6)."""
+class Information(NamedTuple):
+    """The reduced matrix (6 rows, 6 rows) without damping, and what was eliminated: see `sfm.core.optim.schur`.
 
-    W: np.ndarray
-    B: np.ndarray
+    Attributes:
+        centers: (S, 3) of the frames by row.
+        V, M: (P, 6) information about each point alone, and its inverse.
+    """
+
+    reduced: np.ndarray
+    couplings: Couplings
+    centers: np.ndarray
     V: np.ndarray
     M: np.ndarray
 
 
 @dataclasses.dataclass(slots=True)
 class _State:
-    """Parameters as kernels want them; what is constant is the same in both states of a system."""
+    """Parameters as kernels want them; what is constant is the same in both states of a system.
+
+    Attributes:
+        wxyz, centers: (F, 4) and (F, 3) of the frames.
+        frames: their poses; images: rotations (I, 3, 3), translations (I, 3) and poses of the images.
+    """
 
     wxyz: np.ndarray
-    translations: np.ndarray
-    rotations: np.ndarray
+    centers: np.ndarray
+    frames: Rigid3
+    sensors: Rigid3
+    rigs: RigArrays | None
+    images: tuple[np.ndarray, np.ndarray, Rigid3]
     params: np.ndarray
     points3D: np.ndarray
     lost: int = 0
 
-    def copy(self) -> _State:
+    @staticmethod
+    def of(problem: BundleProblem) -> _State:
+        rigs, poses = problem.rigs, problem.cams_from_world
+        frames = poses if rigs is None else rigs.rigs_from_world
         return _State(
-            self.wxyz.copy(), self.translations.copy(), self.rotations.copy(), self.params.copy(), self.points3D.copy()
+            frames.rotation.wxyz.copy(),
+            frames.center.copy(),
+            frames,
+            Rigid3.identity((0,)) if rigs is None else rigs.sensors_from_rig,
+            rigs,
+            _as_arrays(poses),
+            problem.camera_params.copy(),
+            problem.points3D.copy(),
         )
 
+    def copy(self) -> _State:
+        copied = {name: getattr(self, name).copy() for name in ("wxyz", "centers", "params", "points3D")}
+        return dataclasses.replace(self, **copied)
 
-def _priors(problem: BundleProblem, cameras: np.ndarray, columns: np.ndarray) -> tuple[FloatArray, FloatArray]:
-    """Expected values and inverse variances (S, K) of the free parameters of these cameras."""
+    def move(self, delta: FloatArray, layout: Layout, then: _State) -> None:
+        """Fills `then` with the poses and parameters after a step (rows, 6) of the reduced system."""
+        poses, shared = len(layout.slot_frame), layout.shared
+        moves = np.any(delta[:poses] != 0, axis=1)
+        moving, still = layout.slot_frame[moves], layout.slot_frame[~moves]
+        kernels.turn_poses(moving, delta[:poses][moves], self.wxyz, self.centers, then.wxyz, then.centers)
+        then.wxyz[still], then.centers[still] = self.wxyz[still], self.centers[still]
+        then.frames = _moved_poses(self.frames, moving, then.wxyz, then.centers)
+        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        cells = shared.camera[row], shared.columns[row, place]
+        then.params[cells] = self.params[cells] + delta[poses + row, place]
+        if self.rigs is None:
+            then.images = _as_arrays(then.frames)
+            return
+        mounted = np.flatnonzero(shared.sensor >= 0)
+        then.sensors = _shifted(self.sensors, shared.sensor[mounted], delta[poses + mounted])
+        then.rigs = dataclasses.replace(self.rigs, rigs_from_world=then.frames, sensors_from_rig=then.sensors)
+        then.images = _as_arrays(then.rigs.cams_from_world)
+
+
+def _as_arrays(poses: Rigid3) -> tuple[np.ndarray, np.ndarray, Rigid3]:
+    return poses.rotation.matrix, poses.translation, poses
+
+
+def _moved_poses(before: Rigid3, moving: np.ndarray, wxyz: np.ndarray, centers: np.ndarray) -> Rigid3:
+    """Poses of which only `moving` are new, those of `wxyz` and `centers`."""
+    turned = Rotation3(wxyz[moving])
+    translations, turns = before.translation.copy(), before.rotation.wxyz.copy()
+    translations[moving] = -np.einsum("kab,kb->ka", turned.matrix, centers[moving])
+    turns[moving] = turned.wxyz
+    return Rigid3(Rotation3(turns), translations)
+
+
+def _shifted(sensors: Rigid3, moving: np.ndarray, delta: FloatArray) -> Rigid3:
+    """Sensors of which some moved by (ω, υ) on the left: exp(ω) R and exp(ω) t + υ."""
+    turn = Rotation3.exp(delta[:, :3])
+    turns, translations = sensors.rotation.wxyz.copy(), sensors.translation.copy()
+    turns[moving] = (turn @ sensors.rotation[moving]).wxyz
+    translations[moving] = turn @ translations[moving] + delta[:, 3:]
+    return Rigid3(Rotation3(turns), translations)
+
+
+def _values(params: FloatArray, layout: Layout) -> FloatArray:
+    """(T, 6) the parameters in the places of the shared rows; anything where there is none."""
+    columns = np.where(layout.shared.columns < SENSOR_COLUMN, np.maximum(layout.shared.columns, 0), 0)
+    return params[np.maximum(layout.shared.camera, 0)[:, None], columns] if len(params) else np.zeros(columns.shape)
+
+
+def _priors(problem: BundleProblem, layout: Layout) -> tuple[FloatArray, FloatArray]:
+    """Expected values and inverse variances (T, 6) of the free parameters in the shared rows."""
     if problem.prior_params is None or problem.prior_sigmas is None:
-        return np.zeros(columns.shape), np.zeros(columns.shape)
-    index = np.maximum(columns, 0)
-    expected = np.take_along_axis(problem.prior_params[cameras], index, axis=1)
-    weight = np.take_along_axis(problem.prior_sigmas[cameras], index, axis=1) ** -2.0
-    return expected, np.where(columns >= 0, weight, 0.0)
-
-
-def _total(chunks: FloatArray) -> FloatArray:
-    return chunks[0] if len(chunks) == 1 else chunks.sum(axis=0)
+        return np.zeros(layout.shared.columns.shape), np.zeros(layout.shared.columns.shape)
+    is_param = (layout.shared.columns >= 0) & (layout.shared.camera >= 0)[:, None]
+    weight = _values(problem.prior_sigmas, layout) ** -2.0
+    return _values(problem.prior_params, layout), np.where(is_param, weight, 0.0)

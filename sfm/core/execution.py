@@ -22,6 +22,14 @@ def available_threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def machine_bytes() -> int:
+    """Memory of the machine; 8 GiB where it does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 8 << 30
+
+
 def ordered_map(
     function: Callable[[Item], Result], items: Iterable[Item], *, threads: int = 1, ahead: int = 2
 ) -> Iterator[Result]:

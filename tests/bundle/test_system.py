@@ -14,9 +14,16 @@ from sfm.bundle.system import BundleSystem
 from sfm.core.cameras import Camera
 from sfm.core.cameras.models import model_by_id
 from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim import evaluate_loss
 
 DAMPING = 0.03
+
+
+def turned(poses, tangent):
+    """Poses after a step in world axes: R exp(ω), and the centre at C − υ."""
+    rotation = poses.rotation @ Rotation3.exp(tangent[:, :3])
+    return Rigid3(rotation, -(rotation @ (poses.center - tangent[:, 3:])))
 
 
 class Slow:
@@ -36,7 +43,7 @@ class Slow:
         params, points = problem.camera_params.copy(), problem.points3D.copy()
         params[tuple(self.params.T)] += delta[a:b]
         points[self.points] += delta[b:].reshape(-1, 3)
-        poses = Rigid3.exp(tangent) @ problem.cams_from_world
+        poses = turned(problem.cams_from_world, tangent)
         return dataclasses.replace(problem, cams_from_world=poses, camera_params=params, points3D=points)
 
     def residuals(self, delta):
@@ -78,14 +85,14 @@ class Slow:
 
 def system_of(problem, loss, gauge=False):
     layout = lay_out(problem, np.isfinite(squared_errors(problem)))
-    held = held_by_two_cameras(problem, layout) if gauge else np.zeros((len(layout.slot_image), 6), bool)
+    held = held_by_two_cameras(problem, layout) if gauge else np.zeros((len(layout.slot_frame), 6), bool)
     return BundleSystem(problem, layout, held, BundleConfig(loss=loss), 1e4, 1), held
 
 
 def parts(system):
     """Gradient of the system in the order of `Slow`: padding and constant points left out."""
-    shared = system._gradient[~system.held]
-    return np.concatenate([shared, system._g[system._free_points].ravel()])
+    shared = system.gradient[~system.held]
+    return np.concatenate([shared, system._g[system.free_points].ravel()])
 
 
 @pytest.fixture(params=["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "EUCM"])

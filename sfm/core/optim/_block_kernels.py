@@ -1,19 +1,21 @@
-"""Products of tiny matrices in vector registers, for the inner loops of the normal equations.
+"""Products of tiny matrices in vector registers, for the inner loops of the elimination.
 
-    subtract_product(C, A, B)    C −= A B      6×6, 6×3, 3×6
-    add_gram(C, J)               C += Jᵀ J     6×6, 2×6
-    set_product(C, A, B)         C  = Aᵀ B     3×6, 2×3, 2×6
-    add_combination(c, x, y, J)  c += x J₀ + y J₁   the first six of a row, two numbers, 2×6
+    subtract_product(C, factors, B)    C −= A B       6×8, 6×3, 3×8
+    set_product(C, factors, B)         C  = M B       3×8, 3×3 symmetric, 3×8
+    add_combination(c, factors, B)     c += fᵀ B      8, 3, 3×8
 
-Numba keeps LLVM from vectorising straight-line code, and its loop vectoriser has nothing to gain from a loop over
-six. So the compiled form of these functions is written out in vectors of four and two doubles; the plain form below
-is what runs when compilation is off, and what the tests compare with. On x86-64 with AVX2 the elimination of points
-takes less than half of the time with it. Arrays must be contiguous; the product is fused with the sum after it
-where the processor can (`contract`).
+The left factor is a tuple of its numbers (18 of A by rows, 6 of M: xx, xy, xz, yy, yz, zz), so that they stay in
+registers where many products share them.
+
+Rows of six are padded to eight, whole vector registers; what the padding holds means nothing. Numba keeps LLVM from
+vectorising straight-line code, and its loop vectoriser has nothing to gain from a loop over eight. So the compiled form
+is written out in vectors; the plain form below is what runs when compilation is off, and what the tests compare with.
+Arrays must be contiguous; the product is fused with the sum after it where the processor can (`contract`).
 """
 
 from __future__ import annotations
 
+import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic, overload
@@ -21,36 +23,31 @@ from numba.np.arrayobj import make_array
 
 _DOUBLE, _INDEX, _LANE = ir.DoubleType(), ir.IntType(64), ir.IntType(32)
 _FLAGS = ("contract",)
-_HALVES = ((0, 4), (4, 2))
-"""Offset and width of the vectors that make up a row of six."""
+WIDTH = 8
+"""Numbers in a padded row."""
 
 
-def subtract_product(C, A, B):
-    """C −= A B for C (6, 6), A (6, 3), B (3, 6)."""
-    C -= A @ B
+def subtract_product(C, factors, B):
+    """C −= A B for C (6, 8), the 18 `factors` of A (6, 3), B (3, 8)."""
+    C -= np.array(factors).reshape(6, 3) @ B
 
 
-def add_gram(C, J):
-    """C += Jᵀ J for C (6, 6), J (2, 6)."""
-    C += J.T @ J
+def set_product(C, factors, B):
+    """C = M B for C (3, 8), the 6 `factors` of M (3, 3), B (3, 8)."""
+    C[:] = np.array(factors)[np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])].reshape(3, 3) @ B
 
 
-def set_product(C, A, B):
-    """C = Aᵀ B for C (3, 6), A (2, 3), B (2, 6)."""
-    C[:] = A.T @ B
-
-
-def add_combination(c, x, y, J):
-    """c[:6] += x J[0] + y J[1] for J (2, 6)."""
-    c[:6] += x * J[0] + y * J[1]
+def add_combination(c, factors, B):
+    """c += fᵀ B for c (8,), the 3 `factors`, B (3, 8)."""
+    c += np.array(factors) @ B
 
 
 def _element(builder, pointer, offset):
     return builder.gep(pointer, [ir.Constant(_INDEX, offset)])
 
 
-def _vector_pointer(builder, pointer, offset, width):
-    return builder.bitcast(_element(builder, pointer, offset), ir.VectorType(_DOUBLE, width).as_pointer())
+def _row(builder, pointer, number):
+    return builder.bitcast(_element(builder, pointer, WIDTH * number), ir.VectorType(_DOUBLE, WIDTH).as_pointer())
 
 
 def _load(builder, pointer):
@@ -59,74 +56,45 @@ def _load(builder, pointer):
     return value
 
 
-def _store(builder, value, pointer):
-    builder.store(value, pointer).align = 8
-
-
-def _repeated(builder, scalar, width):
-    kind = ir.VectorType(_DOUBLE, width)
+def _repeated(builder, scalar):
+    kind = ir.VectorType(_DOUBLE, WIDTH)
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, scalar, ir.Constant(_LANE, 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_LANE, width), [0] * width))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_LANE, WIDTH), [0] * WIDTH))
 
 
-def _emit(builder, C, B, rows, inner, factor, accumulate, subtract):
-    """Row r of C, or zero, plus or minus the sum over k of factor(r, k) × row k of B."""
-    loaded = [[_load(builder, _vector_pointer(builder, B, 6 * k + at, n)) for at, n in _HALVES] for k in range(inner)]
-    factors = [[factor(r, k) for k in range(inner)] for r in range(rows)]
-    combine = builder.fsub if subtract else builder.fadd
-    for r in range(rows):
-        for half, (at, width) in enumerate(_HALVES):
-            pointer = _vector_pointer(builder, C, 6 * r + at, width)
-            total = _load(builder, pointer) if accumulate else None
-            for k in range(inner):
-                product = builder.fmul(_repeated(builder, factors[r][k], width), loaded[k][half], flags=_FLAGS)
-                total = product if total is None else combine(total, product, flags=_FLAGS)
-            _store(builder, total, pointer)
+def _emit(builder, target, below, factors, sign):
+    """The sum of factors × rows, added to (+1) or subtracted from (−1) the target vector, or alone (None)."""
+    combine = builder.fsub if sign == -1 else builder.fadd
+    for factor, row in zip(factors, below, strict=True):
+        product = builder.fmul(_repeated(builder, factor), row, flags=_FLAGS)
+        target = product if target is None else combine(target, product, flags=_FLAGS)
+    return target
 
 
-def _pointers(context, builder, signature, args):
-    return [make_array(kind)(context, builder, value).data for kind, value in zip(signature.args, args, strict=True)]
+def _intrinsic(rows, numbers, sign):
+    """A product into `rows` vectors, whose row r takes the `numbers[r]` of the tuple of factors."""
+
+    @intrinsic
+    def emitted(typing_context, C, factors, B):
+        def codegen(context, builder, signature, args):
+            c, b = (make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 2))
+            below = [_load(builder, _row(builder, b, k)) for k in range(3)]
+            for r in range(rows):
+                place = _row(builder, c, r)
+                mine = [builder.extract_value(args[1], k) for k in numbers[r]]
+                total = _emit(builder, _load(builder, place) if sign else None, below, mine, sign)
+                builder.store(total, place).align = 8
+            return context.get_dummy_value()
+
+        return types.void(C, factors, B), codegen
+
+    return emitted
 
 
-@intrinsic
-def _subtract_product(typing_context, C, A, B):
-    def codegen(context, builder, signature, args):
-        c, a, b = _pointers(context, builder, signature, args)
-        _emit(builder, c, b, 6, 3, lambda r, k: _load(builder, _element(builder, a, 3 * r + k)), True, True)
-        return context.get_dummy_value()
-
-    return types.void(C, A, B), codegen
-
-
-@intrinsic
-def _add_gram(typing_context, C, J):
-    def codegen(context, builder, signature, args):
-        c, j = _pointers(context, builder, signature, args)
-        _emit(builder, c, j, 6, 2, lambda r, k: _load(builder, _element(builder, j, 6 * k + r)), True, False)
-        return context.get_dummy_value()
-
-    return types.void(C, J), codegen
-
-
-@intrinsic
-def _set_product(typing_context, C, A, B):
-    def codegen(context, builder, signature, args):
-        c, a, b = _pointers(context, builder, signature, args)
-        _emit(builder, c, b, 3, 2, lambda r, k: _load(builder, _element(builder, a, 3 * k + r)), False, False)
-        return context.get_dummy_value()
-
-    return types.void(C, A, B), codegen
-
-
-@intrinsic
-def _add_combination(typing_context, c, x, y, J):
-    def codegen(context, builder, signature, args):
-        row, rows = (make_array(signature.args[k])(context, builder, args[k]).data for k in (0, 3))
-        _emit(builder, row, rows, 1, 2, lambda _, k: args[1 + k], True, False)
-        return context.get_dummy_value()
-
-    return types.void(c, x, y, J), codegen
+_subtract_product = _intrinsic(6, [(3 * r, 3 * r + 1, 3 * r + 2) for r in range(6)], -1)
+_set_product = _intrinsic(3, [(0, 1, 2), (1, 3, 4), (2, 4, 5)], None)
+_add_combination = _intrinsic(1, [(0, 1, 2)], 1)
 
 
 def _is_contiguous(*arrays):
@@ -134,28 +102,21 @@ def _is_contiguous(*arrays):
 
 
 @overload(subtract_product)
-def _compiled_subtract_product(C, A, B):
-    if _is_contiguous(C, A, B):
-        return lambda C, A, B: _subtract_product(C, A, B)  # pyright: ignore[reportCallIssue]
-    return None
-
-
-@overload(add_gram)
-def _compiled_add_gram(C, J):
-    if _is_contiguous(C, J):
-        return lambda C, J: _add_gram(C, J)  # pyright: ignore[reportCallIssue]
+def _compiled_subtract_product(C, factors, B):
+    if _is_contiguous(C, B):
+        return lambda C, factors, B: _subtract_product(C, factors, B)  # pyright: ignore[reportCallIssue]
     return None
 
 
 @overload(set_product)
-def _compiled_set_product(C, A, B):
-    if _is_contiguous(C, A, B):
-        return lambda C, A, B: _set_product(C, A, B)  # pyright: ignore[reportCallIssue]
+def _compiled_set_product(C, factors, B):
+    if _is_contiguous(C, B):
+        return lambda C, factors, B: _set_product(C, factors, B)  # pyright: ignore[reportCallIssue]
     return None
 
 
 @overload(add_combination)
-def _compiled_add_combination(c, x, y, J):
-    if _is_contiguous(c, J) and x == y == types.float64:
-        return lambda c, x, y, J: _add_combination(c, x, y, J)  # pyright: ignore[reportCallIssue]
+def _compiled_add_combination(c, factors, B):
+    if _is_contiguous(c, B):
+        return lambda c, factors, B: _add_combination(c, factors, B)  # pyright: ignore[reportCallIssue]
     return None

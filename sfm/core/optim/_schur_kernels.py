@@ -1,4 +1,4 @@
-"""Kernels of the elimination; the mathematics and the layout are in `schur`.
+"""Kernels of the elimination of points; the mathematics and the layout are in `schur`.
 
 `contract` lets the compiler fuse a product with the sum after it; it reorders nothing and keeps NaN.
 """
@@ -10,7 +10,7 @@ import math
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import subtract_product
+from sfm.core.optim._block_kernels import WIDTH, add_combination, set_product, subtract_product
 
 _RELATIVE_FLOOR = 1e-8
 _PIVOT_FLOOR = 1e-15
@@ -48,62 +48,159 @@ def invert_blocks(first, last, V, damping, M):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def eliminate_poses(order, starts, point, slot, W, M, g, border_offsets, border_slot, B, S, border, b):
-    """Subtracts W M Wᵀ from the rows of S and the border, and adds W M g to b, for the couplings in `order`.
+def fill_coupling(n, u0, u1, u2, w):
+    """w = N [−[u]×, I] (3, 6) for N as (xx, xy, xz, yy, yz, zz)."""
+    w[0, 0], w[0, 1], w[0, 2] = n[2] * u1 - n[1] * u2, n[0] * u2 - n[2] * u0, n[1] * u0 - n[0] * u1
+    w[1, 0], w[1, 1], w[1, 2] = n[4] * u1 - n[3] * u2, n[1] * u2 - n[4] * u0, n[3] * u0 - n[1] * u1
+    w[2, 0], w[2, 1], w[2, 2] = n[5] * u1 - n[4] * u2, n[2] * u2 - n[5] * u0, n[4] * u0 - n[2] * u1
+    w[0, 3], w[0, 4], w[0, 5] = n[0], n[1], n[2]
+    w[1, 3], w[1, 4], w[1, 5] = n[1], n[3], n[4]
+    w[2, 3], w[2, 4], w[2, 5] = n[2], n[4], n[5]
 
-    Args:
-        order: couplings whose rows this call owns. Within a row points must not fall: the order of summation.
-        starts: (P,) first coupling of a point that has a slot; from there on slots do not fall.
-        point, slot, W: point (n,), block row (n,) and block (n, 3, 6), transposed, of the couplings.
-        M, g: inverse blocks (P, 6) and gradients (P, 3) of the points.
-        border_offsets, border_slot, B: couplings of the border, (P + 1,), (E,), (E, 3, K), transposed.
-        S: (I (I + 1) / 2, 6, 6) the blocks of the lower triangle, row by row.
-        border: (I, C K, 6); b: (I, 6).
-    """
-    Y = np.empty((6, 3))
-    size = B.shape[2]
-    for index in range(len(order)):
-        o = order[index]
-        p, i = point[o], slot[o]
-        m0, m1, m2, m3, m4, m5 = M[p, 0], M[p, 1], M[p, 2], M[p, 3], M[p, 4], M[p, 5]
-        g0, g1, g2 = g[p, 0], g[p, 1], g[p, 2]
-        w = W[o]
-        for r in range(6):
-            Y[r, 0] = w[0, r] * m0 + w[1, r] * m1 + w[2, r] * m2
-            Y[r, 1] = w[0, r] * m1 + w[1, r] * m3 + w[2, r] * m4
-            Y[r, 2] = w[0, r] * m2 + w[1, r] * m4 + w[2, r] * m5
-            b[i, r] += Y[r, 0] * g0 + Y[r, 1] * g1 + Y[r, 2] * g2
-        row = S[i * (i + 1) // 2 : (i + 1) * (i + 2) // 2]
-        for j in range(starts[p], o + 1):
-            subtract_product(row[slot[j]], Y, W[j])
-            if slot[j] == i and j != o:
-                # An image that sees the point twice: the mirrored product falls on the same block.
-                for r in range(6):
-                    for c in range(6):
-                        row[i, c, r] -= Y[r, 0] * W[j, 0, c] + Y[r, 1] * W[j, 1, c] + Y[r, 2] * W[j, 2, c]
-        for e in range(border_offsets[p], border_offsets[p + 1]):
-            below = border_slot[e] * size
-            for c in range(size):
-                x, y, z = B[e, 0, c], B[e, 1, c], B[e, 2, c]
-                for r in range(6):
-                    border[i, below + c, r] -= Y[r, 0] * x + Y[r, 1] * y + Y[r, 2] * z
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _by_columns(y):
+    """The first six columns of a 3×8 matrix, one after the other."""
+    return (
+        y[0, 0], y[1, 0], y[2, 0], y[0, 1], y[1, 1], y[2, 1], y[0, 2], y[1, 2], y[2, 2],
+        y[0, 3], y[1, 3], y[2, 3], y[0, 4], y[1, 4], y[2, 4], y[0, 5], y[1, 5], y[2, 5],
+    )  # fmt: skip
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def eliminate_border(order, starts, point, slot, B, M, g, S, b):
-    """The same for the border itself: B M Bᵀ off the rows of S (C K, C K), and B M g onto b (C K)."""
-    size = B.shape[2]
-    for index in range(len(order)):
-        o = order[index]
-        p = point[o]
-        row = slot[o] * size
-        m0, m1, m2, m3, m4, m5 = M[p, 0], M[p, 1], M[p, 2], M[p, 3], M[p, 4], M[p, 5]
-        for r in range(size):
-            y0 = B[o, 0, r] * m0 + B[o, 1, r] * m1 + B[o, 2, r] * m2
-            y1 = B[o, 0, r] * m1 + B[o, 1, r] * m3 + B[o, 2, r] * m4
-            y2 = B[o, 0, r] * m2 + B[o, 1, r] * m4 + B[o, 2, r] * m5
-            b[row + r] += y0 * g[p, 0] + y1 * g[p, 1] + y2 * g[p, 2]
-            for j in range(starts[p], o + 1):
-                column = slot[j] * size
-                for c in range(size):
-                    S[row + r, column + c] -= y0 * B[j, 0, c] + y1 * B[j, 1, c] + y2 * B[j, 2, c]
+def eliminate(
+    first_row, last_row, starts, slot, N, shared_starts, shared_slot, B, centers, X, M, g, offsets, columns,
+    blocks, side, diagonal,
+):  # fmt: skip
+    """Adds the poses' own blocks to the rows `first_row:last_row` of S and takes off what goes with the points.
+
+    Blocks that the pattern lacks are left out. `diagonal` (rows, 6) gets what the poses' own blocks have there.
+
+    Args:
+        starts, slot, N: by point (P + 1,), the row of each coupling with a pose (E,), ascending, and its (E, 6).
+        shared_starts, shared_slot, B: the same for shared rows, which lie behind those of poses; (G, 3, 6).
+        centers: (S, 3) of the poses by row; X: (P, 3).
+        M, g: inverse blocks (P, 6), zero for points that do not move, and gradients (P, 3).
+        offsets, columns: the pattern of `blocks` (·, 6, 8), rows padded; side: (rows, 8).
+    """
+    longest = 1
+    for p in range(len(X)):
+        longest = max(longest, starts[p + 1] - starts[p] + shared_starts[p + 1] - shared_starts[p])
+    W, rows = np.zeros((longest, 3, WIDTH)), np.empty(longest, np.int64)
+    Y = np.empty((3, WIDTH))
+    for p in range(len(X)):
+        poses, shared = starts[p + 1] - starts[p], shared_starts[p + 1] - shared_starts[p]
+        first, last = starts[p], shared_starts[p]
+        moves = M[p, 0] > 0.0
+        count = poses + shared
+        if (
+            count == 0
+            or (slot[first] if poses > 0 else shared_slot[last]) >= last_row
+            or (shared_slot[last + shared - 1] if shared > 0 else slot[first + poses - 1]) < first_row
+        ):
+            continue
+        for k in range(poses):
+            s = slot[first + k]
+            if s >= last_row:
+                count = k
+                break
+            rows[k] = s
+            u0, u1, u2 = X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2]
+            fill_coupling(N[first + k], u0, u1, u2, W[k])
+        for k in range(poses, count):
+            rows[k] = shared_slot[last + k - poses]
+            block, w = B[last + k - poses], W[k]
+            for r in range(3):
+                for c in range(6):
+                    w[r, c] = block[r, c]
+        information = (M[p, 0], M[p, 1], M[p, 2], M[p, 3], M[p, 4], M[p, 5])
+        gradient = (g[p, 0], g[p, 1], g[p, 2])
+        for k in range(count):
+            i = rows[k]
+            if i < first_row or i >= last_row:
+                continue
+            w = W[k]
+            if moves:
+                set_product(Y, information, w)
+                add_combination(side[i], gradient, Y)
+                factors = _by_columns(Y)
+                # Columns ascend: the block in column j is at most as far ahead as j itself.
+                at, end = offsets[i], offsets[i + 1] - 1
+                for j in range(k):
+                    wanted = rows[j]
+                    if columns[at] > wanted:
+                        continue
+                    ahead = min(at + wanted - columns[at], end)
+                    while columns[ahead] > wanted:
+                        ahead -= 1
+                    if columns[ahead] == wanted:
+                        subtract_product(blocks[ahead], factors, W[j])
+                        at = ahead
+            if k < poses:
+                u0, u1, u2 = X[p, 0] - centers[i, 0], X[p, 1] - centers[i, 1], X[p, 2] - centers[i, 2]
+                # The pose's own block is [−[u]×, I]ᵀ W: one product does for it and for what is taken off.
+                if not moves:
+                    for r in range(3):
+                        for c in range(6):
+                            Y[r, c] = 0.0
+                Y[1, 0] += u2
+                Y[2, 0] -= u1
+                Y[0, 1] -= u2
+                Y[2, 1] += u0
+                Y[0, 2] += u1
+                Y[1, 2] -= u0
+                Y[0, 3] -= 1.0
+                Y[1, 4] -= 1.0
+                Y[2, 5] -= 1.0
+                diagonal[i, 0] += u1 * w[2, 0] - u2 * w[1, 0]
+                diagonal[i, 1] += u2 * w[0, 1] - u0 * w[2, 1]
+                diagonal[i, 2] += u0 * w[1, 2] - u1 * w[0, 2]
+                diagonal[i, 3] += w[0, 3]
+                diagonal[i, 4] += w[1, 4]
+                diagonal[i, 5] += w[2, 5]
+            if moves or k < poses:
+                subtract_product(blocks[offsets[i + 1] - 1], _by_columns(Y), w)
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def multiply(first, last, starts, slot, N, shared_starts, shared_slot, B, centers, X, M, x, y):
+    """Adds to y (rows, 6) what poses' own blocks and the points `first:last` contribute to S x."""
+    for p in range(first, last):
+        z0 = z1 = z2 = 0.0
+        for e in range(starts[p], starts[p + 1]):
+            s, n = slot[e], N[e]
+            u0, u1, u2 = X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2]
+            d0 = x[s, 1] * u2 - x[s, 2] * u1 + x[s, 3]
+            d1 = x[s, 2] * u0 - x[s, 0] * u2 + x[s, 4]
+            d2 = x[s, 0] * u1 - x[s, 1] * u0 + x[s, 5]
+            z0 += n[0] * d0 + n[1] * d1 + n[2] * d2
+            z1 += n[1] * d0 + n[3] * d1 + n[4] * d2
+            z2 += n[2] * d0 + n[4] * d1 + n[5] * d2
+        for e in range(shared_starts[p], shared_starts[p + 1]):
+            s, block = shared_slot[e], B[e]
+            for c in range(6):
+                z0 += block[0, c] * x[s, c]
+                z1 += block[1, c] * x[s, c]
+                z2 += block[2, c] * x[s, c]
+        w0 = M[p, 0] * z0 + M[p, 1] * z1 + M[p, 2] * z2
+        w1 = M[p, 1] * z0 + M[p, 3] * z1 + M[p, 4] * z2
+        w2 = M[p, 2] * z0 + M[p, 4] * z1 + M[p, 5] * z2
+        for e in range(starts[p], starts[p + 1]):
+            s, n = slot[e], N[e]
+            u0, u1, u2 = X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2]
+            d0 = x[s, 1] * u2 - x[s, 2] * u1 + x[s, 3] - w0
+            d1 = x[s, 2] * u0 - x[s, 0] * u2 + x[s, 4] - w1
+            d2 = x[s, 0] * u1 - x[s, 1] * u0 + x[s, 5] - w2
+            v0 = n[0] * d0 + n[1] * d1 + n[2] * d2
+            v1 = n[1] * d0 + n[3] * d1 + n[4] * d2
+            v2 = n[2] * d0 + n[4] * d1 + n[5] * d2
+            y[s, 0] += u1 * v2 - u2 * v1
+            y[s, 1] += u2 * v0 - u0 * v2
+            y[s, 2] += u0 * v1 - u1 * v0
+            y[s, 3] += v0
+            y[s, 4] += v1
+            y[s, 5] += v2
+        for e in range(shared_starts[p], shared_starts[p + 1]):
+            s, block = shared_slot[e], B[e]
+            for c in range(6):
+                y[s, c] -= block[0, c] * w0 + block[1, c] * w1 + block[2, c] * w2

@@ -58,3 +58,18 @@ class BlockPattern(Value):
     def diagonal(self) -> np.ndarray:
         """(N,) the number of each row's diagonal block."""
         return self.offsets[1:] - 1
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no block is missing."""
+        return 2 * len(self.columns) == self.rows * (self.rows + 1)
+
+    def find(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """(n,) the numbers of the blocks in `rows` and `columns`, of the lower triangle; −1 for those it lacks."""
+        if not len(self.columns):
+            return np.full(len(rows), -1)
+        count = np.int64(self.rows)
+        keys = np.repeat(np.arange(self.rows, dtype=np.int64), np.diff(self.offsets)) * count + self.columns
+        wanted = np.asarray(rows, np.int64) * count + columns
+        found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+        return np.where(keys[found] == wanted, found, -1)

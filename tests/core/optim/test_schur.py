@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm.core.optim import schur
+from sfm.core.optim.block_pattern import BlockPattern
 
 
 def packed(blocks):
@@ -38,76 +39,97 @@ def test_inverses_of_singular_blocks_are_finite_and_positive_semidefinite(rng):
         assert np.all(M[40] == 0)
 
 
-def random_couplings(rng, points, poses, cameras, size):
-    """Couplings as the kernels want them: sorted by point and slot, an image twice in some points."""
-    rows = [np.sort(rng.integers(0, poses, rng.integers(1, 6))) for _ in range(points)]
-    point = np.repeat(np.arange(points), [len(r) for r in rows]).astype(np.int32)
-    slot = np.concatenate(rows).astype(np.int32)
-    starts = np.searchsorted(point, np.arange(points))
-    border = [np.flatnonzero(rng.random(cameras) < 0.6) for _ in range(points)]
-    border_point = np.repeat(np.arange(points), [len(r) for r in border]).astype(np.int32)
-    border_slot = np.concatenate(border).astype(np.int32)
-    offsets = np.searchsorted(border_point, np.arange(points + 1))
-    W, B = rng.normal(size=(len(slot), 3, 6)), rng.normal(size=(len(border_slot), 3, size))
-    return point, slot, starts, W, border_point, border_slot, offsets, B
+def skew(u):
+    return np.array([[0, -u[2], u[1]], [u[2], 0, -u[0]], [-u[1], u[0], 0]])
 
 
-@pytest.mark.parametrize(("stripes", "copies"), [(1, 1), (3, 1), (3, 3)])
-def test_elimination_equals_the_dense_schur_complement(rng, stripes, copies):
-    points, poses, cameras, size = 30, 5, 2, 3
-    point, slot, starts, W, border_point, border_slot, offsets, B = random_couplings(rng, points, poses, cameras, size)
-    M = packed(np.einsum("pki,pkj->pij", *[rng.normal(size=(points, 4, 3))] * 2))
-    g = rng.normal(size=(points, 3))
-    system = schur.ReducedSystem.allocate(poses, cameras * size, copies)
-    for k in range(stripes):
-        mine = np.flatnonzero(slot % stripes == k)
-        schur.eliminate_poses(
-            mine, starts, point, slot, W, M, g, offsets, border_slot, B,
-            system.blocks[k % copies], system.border[k % copies], system.pose_side[k % copies],
-        )  # fmt: skip
-    everything = np.arange(len(border_slot))
-    corner, corner_side = system.corner[0], system.corner_side[0]
-    schur.eliminate_border(everything, offsets, border_point, border_slot, B, M, g, corner, corner_side)
-    S, side = system.matrix(), system.side()
+class Problem:
+    """Couplings as the kernels want them, and the dense matrices they stand for."""
 
-    E = np.zeros((6 * poses + cameras * size, 3 * points))
-    for o in range(len(slot)):
-        E[6 * slot[o] : 6 * slot[o] + 6, 3 * point[o] : 3 * point[o] + 3] += W[o].T
-    for e in range(len(border_slot)):
-        row = 6 * poses + size * border_slot[e]
-        E[row : row + size, 3 * border_point[e] : 3 * border_point[e] + 3] += B[e].T
-    inverse = np.zeros((3 * points, 3 * points))
-    for p, block in enumerate(unpacked(M)):
-        inverse[3 * p : 3 * p + 3, 3 * p : 3 * p + 3] = block
-    np.testing.assert_allclose(np.tril(S), np.tril(-E @ inverse @ E.T), atol=1e-11)
-    np.testing.assert_allclose(side, E @ inverse @ g.ravel(), atol=1e-11)
+    def __init__(self, rng, points=30, poses=5, shared=2):
+        self.points, self.poses, self.rows = points, poses, poses + shared
+        seen = [np.flatnonzero(rng.random(poses) < 0.6) for _ in range(points)]
+        also = [poses + np.flatnonzero(rng.random(shared) < 0.6) for _ in range(points)]
+        self.starts = np.cumsum([0, *map(len, seen)])
+        self.slot = np.concatenate(seen).astype(np.int32)
+        self.shared_starts = np.cumsum([0, *map(len, also)])
+        self.shared_slot = np.concatenate(also).astype(np.int32)
+        J = rng.normal(size=(len(self.slot), 4, 3))
+        self.N = packed(np.einsum("pki,pkj->pij", J, J))
+        self.B = rng.normal(size=(len(self.shared_slot), 3, 6))
+        self.centers, self.X = rng.normal(size=(poses, 3)), rng.normal(size=(points, 3))
+        self.M = packed(np.einsum("pki,pkj->pij", *[rng.normal(size=(points, 4, 3))] * 2))
+        self.M[7] = 0  # a point that does not move
+        self.g = rng.normal(size=(points, 3))
+        self.g[7] = 0
 
+    @property
+    def couplings(self):
+        return schur.Couplings(self.starts, self.slot, self.N, self.shared_starts, self.shared_slot, self.B)
 
-def small_system(rng, definite=True):
-    J = rng.normal(size=(40, 15))
-    full = J.T @ J if definite else -J.T @ J
-    system = schur.ReducedSystem.allocate(2, 3)
-    blocks = full[:12, :12].reshape(2, 6, 2, 6).transpose(0, 2, 1, 3)
-    system.blocks[0] = blocks[[0, 1, 1], [0, 0, 1]]
-    system.border[0] = full[12:, :12].reshape(3, 2, 6).transpose(1, 0, 2)
-    system.corner[0] = full[12:, 12:]
-    side = rng.normal(size=15)
-    system.pose_side[0], system.corner_side[0] = side[:12].reshape(2, 6), side[12:]
-    return system, full, side
+    def eliminate(self, pattern, ranges):
+        blocks, side = np.zeros((len(pattern.columns), 6, 8)), np.zeros((self.rows, 8))
+        diagonal = np.zeros((self.rows, 6))
+        for first, last in ranges:
+            schur.eliminate(
+                first, last, *self.couplings, self.centers, self.X, self.M, self.g, pattern.offsets, pattern.columns,
+                blocks, side, diagonal,
+            )  # fmt: skip
+        return blocks[:, :, :6], side[:, :6], diagonal
 
-
-def test_the_reduced_system_is_solved_with_held_entries_at_zero(rng):
-    system, full, side = small_system(rng)
-    held = np.zeros(15, bool)
-    held[[0, 7, 13]] = True
-    damping = np.linspace(0.1, 1, 15)
-    delta = schur.solve_reduced(system, damping, held)
-    keep = ~held
-    expected = np.linalg.solve((full + np.diag(damping))[np.ix_(keep, keep)], side[keep])
-    assert np.all(delta[held] == 0)
-    np.testing.assert_allclose(delta[keep], expected, rtol=1e-9, atol=1e-12)
+    def dense(self):
+        """U of the poses, S and the right-hand side."""
+        U, E = np.zeros((6 * self.rows, 6 * self.rows)), np.zeros((6 * self.rows, 3 * self.points))
+        inverse = np.zeros((3 * self.points, 3 * self.points))
+        for p, m in enumerate(unpacked(self.M)):
+            mine = slice(3 * p, 3 * p + 3)
+            inverse[mine, mine] = m
+            for e in range(self.starts[p], self.starts[p + 1]):
+                s, N = self.slot[e], unpacked(self.N[e : e + 1])[0]
+                T = np.c_[-skew(self.X[p] - self.centers[s]), np.eye(3)]
+                U[6 * s : 6 * s + 6, 6 * s : 6 * s + 6] += T.T @ N @ T
+                E[6 * s : 6 * s + 6, mine] += (N @ T).T
+            for e in range(self.shared_starts[p], self.shared_starts[p + 1]):
+                s = self.shared_slot[e]
+                E[6 * s : 6 * s + 6, mine] += self.B[e].T
+        return U, U - E @ inverse @ E.T, E @ inverse @ self.g.ravel()
 
 
-def test_an_indefinite_system_has_no_solution(rng):
-    system, _, _ = small_system(rng, definite=False)
-    assert schur.solve_reduced(system, np.zeros(15), np.zeros(15, bool)) is None
+def assembled(pattern, blocks):
+    S = np.zeros((6 * pattern.rows, 6 * pattern.rows))
+    for i in range(pattern.rows):
+        for k in range(pattern.offsets[i], pattern.offsets[i + 1]):
+            j = pattern.columns[k]
+            S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] = blocks[k]
+    return np.tril(S)
+
+
+@pytest.mark.parametrize("ranges", [[(0, 7)], [(0, 3), (3, 6), (6, 7)]])
+def test_elimination_equals_the_dense_schur_complement(rng, ranges):
+    problem, pattern = Problem(rng), BlockPattern.full(7)
+    blocks, side, diagonal = problem.eliminate(pattern, ranges)
+    U, S, expected = problem.dense()
+    np.testing.assert_allclose(assembled(pattern, blocks), np.tril(S), atol=1e-10)
+    np.testing.assert_allclose(side.ravel(), expected, atol=1e-10)
+    np.testing.assert_allclose(diagonal.ravel(), np.diag(U), atol=1e-10)
+
+
+def test_a_pattern_with_fewer_blocks_gets_those_it_has(rng):
+    problem, pattern = Problem(rng), BlockPattern.of_pairs(7, np.array([2, 5, 6]), np.array([0, 3, 4]))
+    blocks, side, _ = problem.eliminate(pattern, [(0, 7)])
+    _, S, expected = problem.dense()
+    np.testing.assert_allclose(side.ravel(), expected, atol=1e-10)
+    for i in range(7):
+        for k in range(pattern.offsets[i], pattern.offsets[i + 1]):
+            j, kept = pattern.columns[k], slice(None) if pattern.columns[k] < i else np.tril_indices(6)
+            wanted = S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+            np.testing.assert_allclose(blocks[k][kept], wanted[kept], atol=1e-10)
+
+
+def test_the_product_without_the_matrix_equals_that_with_it(rng):
+    problem = Problem(rng)
+    x, y = rng.normal(size=(7, 6)), np.zeros((7, 6))
+    for first, last in ((0, 11), (11, 30)):
+        schur.multiply(first, last, *problem.couplings, problem.centers, problem.X, problem.M, x, y)
+    _, S, _ = problem.dense()
+    np.testing.assert_allclose(y.ravel(), S @ x.ravel(), atol=1e-10)

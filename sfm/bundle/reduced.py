@@ -1,0 +1,293 @@
+"""The reduced system of a problem: its assembly, and the ways to solve it.
+
+    dense       Cholesky factor of all of S
+    sparse      Cholesky factor of the blocks that points couple, in an order that keeps it sparse
+    iterative   conjugate gradients; S is known by its products alone (`schur.multiply`), and only what the
+                preconditioner needs of it is formed: the blocks of pairs of rows within clusters
+
+The factors are exact and for one step about as accurate as the machine; gradients stop once a step gains little
+(see `conjugate_gradients`). `auto` takes what is the fastest by a forecast, and gradients where the factor would not
+fit into half of the machine's memory.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm.bundle import _layout_kernels as kernels
+from sfm.bundle.layout import Layout
+from sfm.bundle.problem import SolverChoice
+from sfm.core.arrays import BoolArray, FloatArray
+from sfm.core.execution import machine_bytes, ordered_map
+from sfm.core.optim._block_kernels import WIDTH
+from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.conjugate_gradients import conjugate_gradients
+from sfm.core.optim.preconditioners import clusters_of, restricted_pattern
+from sfm.core.optim.schur import Couplings, eliminate, multiply
+from sfm.core.optim.solvers import Forecast, ReducedSolver, choose_solver
+from sfm.core.optim.sparse_cholesky import SparseCholesky
+
+_FLOOR = 1e-8
+"""Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
+_FULL_ROWS = 200
+"""Up to here the pattern is full without a look at what points couple."""
+_PRODUCT_SECONDS_PER_COUPLING, _PRODUCTS_PER_STEP = 1.5e-8, 150
+"""Measured on one core, and a guess at how many products a step takes."""
+_MODEL_TOLERANCE, _RESIDUAL_TOLERANCE, _MAX_GRADIENTS = 0.01, 1e-9, 500
+_CLUSTER_ROWS = 60
+
+
+class SolverPlan(NamedTuple):
+    """What was chosen to solve the reduced system, and what it will take.
+
+    Attributes:
+        kind: dense, sparse or iterative.
+        pattern: the blocks of S that are formed; solver: what factors them.
+        bytes: for S and its factor.
+    """
+
+    kind: SolverChoice
+    pattern: BlockPattern
+    solver: ReducedSolver
+    bytes: int
+
+
+def plan_solver(layout: Layout, held: BoolArray, choice: SolverChoice) -> SolverPlan:
+    """Chooses a solver for the rows of `layout`, of whose unknowns (rows, 6) some are `held`."""
+    rows, unknowns = layout.rows, held.ravel()
+    if rows <= _FULL_ROWS and choice in ("auto", "dense"):
+        pattern = BlockPattern.full(rows)
+        solver, forecast = choose_solver(pattern, unknowns, "dense")
+        return _plan("dense", pattern, solver, forecast)
+    pattern = layout.pattern()
+    if choice == "iterative":
+        return _iterative(layout, pattern, unknowns)
+    solver, forecast = choose_solver(pattern, unknowns, choice)
+    kind = "sparse" if isinstance(solver, SparseCholesky) else "dense"
+    plan = _plan(kind, pattern, solver, forecast)
+    couplings = len(layout.slot) + 3 * len(layout.shared_slot)
+    too_slow = forecast.seconds > _PRODUCTS_PER_STEP * _PRODUCT_SECONDS_PER_COUPLING * couplings
+    if choice == "auto" and (too_slow or plan.bytes > machine_bytes() / 2):
+        return _iterative(layout, pattern, unknowns)
+    return plan
+
+
+def _plan(kind: SolverChoice, pattern: BlockPattern, solver: ReducedSolver, forecast: Forecast) -> SolverPlan:
+    return SolverPlan(kind, pattern, solver, forecast.bytes + 8 * BLOCK * WIDTH * len(pattern.columns))
+
+
+def _iterative(layout: Layout, pattern: BlockPattern, unknowns: BoolArray) -> SolverPlan:
+    """Gradients with clusters of rows that share many points as preconditioner."""
+    weights = np.zeros(len(pattern.columns))
+    kernels.count_pairs(layout.starts, layout.slot, pattern.offsets, pattern.columns, weights)
+    near, _ = restricted_pattern(pattern, clusters_of(pattern, weights, _CLUSTER_ROWS))
+    solver, forecast = choose_solver(near, unknowns, "sparse")
+    return _plan("iterative", near, solver, forecast)
+
+
+class ReducedSystem:
+    """S, its right-hand side and the solver; lives as long as one adjustment.
+
+    Attributes:
+        gradient: (rows, 6) of the problem by its rows, 0 where held.
+        scaling: (rows, 6) λD of the last solution.
+    """
+
+    def __init__(self, layout: Layout, held: BoolArray, couplings: Couplings, plan: SolverPlan, threads: int) -> None:
+        self.plan, self._layout, self._held, self._couplings, self._threads = plan, layout, held, couplings, threads
+        self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
+        self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
+        self._own = _OwnBlocks(layout, plan.pattern)
+        self._ranges = layout.row_ranges(max(threads, 1))
+        self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
+        self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
+
+    def take_over(self, images: ImageSums, priors: FloatArray, prior_gradient: FloatArray) -> None:
+        """Takes over a linearisation: the sums of images, and weights and gradient (T, 6) of priors on shared rows."""
+        self._own.set(images.F, images.G, priors)
+        self._own_gradient = self._own.gradient(images.h, images.f)
+        self._own_gradient[len(self._layout.slot_frame) :] += prior_gradient
+        self.gradient = np.where(self._held, 0.0, self._own_gradient)
+
+    def eliminate(self, centers: FloatArray, points3D: FloatArray, M: FloatArray, g: FloatArray) -> None:
+        """Fills S, its right-hand side and the diagonal of the normal matrix.
+
+        Args:
+            centers: (S, 3) of the frames by row.
+            M, g: inverse damped blocks (P, 6) and gradients (P, 3) of the points.
+        """
+        pattern, self._points = self.plan.pattern, (centers, points3D, M)
+        self._blocks.fill(0)
+        self._own.add(self._blocks)
+        self._side[:, :BLOCK] = -self._own_gradient
+        self._diagonal[:] = self._own.diagonal
+
+        def rows(job: tuple[int, int]) -> None:
+            eliminate(
+                *job, *self._couplings, *self._points, g,
+                pattern.offsets, pattern.columns, self._blocks, self._side, self._diagonal,
+            )  # fmt: skip
+
+        list(ordered_map(rows, self._ranges, threads=self._threads))
+
+    def solve(self, damping: float) -> FloatArray | None:
+        """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
+        self.scaling = damping * self._marquardt_diagonal()
+        if not self.plan.solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._threads):
+            return None
+        side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
+        if self.plan.kind == "iterative":
+            found = conjugate_gradients(
+                self._multiplied, side, self.plan.solver.solve, model_tolerance=_MODEL_TOLERANCE,
+                residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
+            )  # fmt: skip
+            delta = found.x if found.iterations else np.full(len(side), np.nan)
+        else:
+            delta = self.plan.solver.solve(side)
+        return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
+
+    def matrix(self) -> FloatArray:
+        """S (6 rows, 6 rows) in full; where it is formed, all of its blocks."""
+        pattern, size = self.plan.pattern, self._layout.rows
+        S = np.zeros((size, size, BLOCK, BLOCK))
+        rows = np.repeat(np.arange(size), np.diff(pattern.offsets))
+        S[rows, pattern.columns] = self._blocks[:, :, :BLOCK]
+        lower = np.tril(S.transpose(0, 2, 1, 3).reshape(BLOCK * size, BLOCK * size))
+        return lower + np.tril(lower, -1).T
+
+    def _multiplied(self, x: FloatArray) -> FloatArray:
+        """(S + λD) x without S; each chunk of points has its own sum, and these are added in order."""
+        wide, chunks = x.reshape(-1, BLOCK), self._layout.point_chunks
+        sums = np.zeros((len(chunks), *wide.shape))
+
+        def points(job: tuple[int, tuple[int, int]]) -> None:
+            k, chunk = job
+            multiply(*chunk, *self._couplings, *self._points, wide, sums[k])
+
+        list(ordered_map(points, list(enumerate(chunks)), threads=self._threads))
+        product = sums.sum(axis=0) + self._own.product(wide) + self.scaling * wide
+        return np.where(self._held, 0.0, product).ravel()
+
+    def _marquardt_diagonal(self) -> FloatArray:
+        """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
+        poses = len(self._layout.slot_frame)
+        raised = []
+        for part in (self._diagonal[:poses], self._diagonal[poses:]):
+            largest = part.max(axis=0, initial=0.0)
+            raised.append(np.maximum(part, np.where(largest > 0, _FLOOR * largest, 1.0)))
+        return np.concatenate(raised)
+
+
+@dataclasses.dataclass(slots=True)
+class ImageSums:
+    """What images contribute to a linearisation; k columns of parameters that they share, m shared rows.
+
+    Attributes:
+        h: (I, 6) gradient of the frame; f: (I, k) that of the columns.
+        F: (I, 6, k) products of the frame's tangent with the columns.
+        G: (I, k, k) products of the columns, lower triangle.
+    """
+
+    h: np.ndarray
+    F: np.ndarray
+    G: np.ndarray
+    f: np.ndarray
+
+    @staticmethod
+    def allocate(images: int, columns: int) -> ImageSums:
+        """For that many images and columns."""
+        return ImageSums(
+            np.zeros((images, BLOCK)), np.zeros((images, BLOCK, columns)),
+            np.zeros((images, columns, columns)), np.zeros((images, columns)),
+        )  # fmt: skip
+
+    def clear(self) -> None:
+        """Sets everything to zero."""
+        for part in (self.h, self.F, self.G, self.f):
+            part.fill(0)
+
+
+class _OwnBlocks:
+    """What images and priors contribute to S and its gradient, whatever becomes of the points.
+
+    But for the blocks of poses themselves, which the elimination adds.
+    """
+
+    def __init__(self, layout: Layout, pattern: BlockPattern) -> None:
+        shared, slots = layout.image_shared, layout.image_slot
+        self._images, self._most = shared.shape
+        self._rows_count, self._place = layout.rows, layout.column_place
+        self._shared, self._moving = shared >= 0, slots >= 0
+        self._coupled = self._shared & self._moving[:, None]
+        self._both = self._shared[:, :, None] & self._shared[:, None, :] & np.tri(self._most, dtype=bool)
+        self._used = np.arange(layout.columns.shape[1]) < layout.column_count[:, None]
+        images, k = np.nonzero(self._coupled)
+        i, a, b = np.nonzero(self._both)
+        diagonal = len(layout.slot_frame) + np.arange(len(layout.shared), dtype=np.int64)
+        rows = np.concatenate([shared[images, k], shared[i, a], diagonal])
+        columns = np.concatenate([slots[images], shared[i, b], diagonal])
+        self._sums = _Sums(rows.astype(np.int64) * layout.rows + columns)
+        self._rows, self._columns = np.divmod(self._sums.targets, max(layout.rows, 1))
+        self._numbers = pattern.find(self._rows, self._columns)
+        self._gradients = _Sums(np.concatenate([slots[self._moving], shared[self._shared]]))
+        self._blocks = np.zeros((len(self._rows), BLOCK, BLOCK))
+
+    def set(self, F: FloatArray, G: FloatArray, prior_weight: FloatArray) -> None:
+        """Takes over the sums of a linearisation, and the weights of the priors on parameters (T, 6)."""
+        size = self._most * BLOCK
+        wide, square = np.zeros((self._images, size, BLOCK)), np.zeros((self._images, size, size))
+        image, k = np.nonzero(self._used)
+        wide[image, self._place[image, k]] = F[image, :, k]
+        lower = self._used[:, :, None] & self._used[:, None, :] & np.tri(self._used.shape[1], dtype=bool)
+        image, a, b = np.nonzero(lower)
+        values = G[image, a, b]
+        a, b = self._place[image, a], self._place[image, b]
+        square[image, a, b] = square[image, b, a] = values
+        square = square.reshape(self._images, self._most, BLOCK, self._most, BLOCK).transpose(0, 1, 3, 2, 4)
+        wide = wide.reshape(self._images, self._most, BLOCK, BLOCK)
+        priors = prior_weight[:, :, None] * np.eye(BLOCK)
+        self._blocks = self._sums.of(np.concatenate([wide[self._coupled], square[self._both], priors]))
+
+    def add(self, blocks: FloatArray) -> None:
+        """Adds them to those blocks of the reduced system that are formed."""
+        formed = self._numbers >= 0
+        blocks[self._numbers[formed], :, :BLOCK] += self._blocks[formed]
+
+    @property
+    def diagonal(self) -> FloatArray:
+        """(rows, 6) what they have on the diagonal of S."""
+        out, own = np.zeros((self._rows_count, BLOCK)), self._rows == self._columns
+        out[self._rows[own]] = np.einsum("kaa->ka", self._blocks[own])
+        return out
+
+    def gradient(self, h: FloatArray, f: FloatArray) -> FloatArray:
+        """(rows, 6) from those of the images' frames (I, 6) and columns (I, k)."""
+        wide, rows = np.zeros((self._images, self._most * BLOCK)), np.zeros((self._rows_count, BLOCK))
+        image, k = np.nonzero(self._used)
+        wide[image, self._place[image, k]] = f[image, k]
+        shared = wide.reshape(self._images, self._most, BLOCK)[self._shared]
+        rows[self._gradients.targets] = self._gradients.of(np.concatenate([h[self._moving], shared]))
+        return rows
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """What they contribute to S x, for x (rows, 6)."""
+        out, beside = np.zeros_like(x), self._rows != self._columns
+        np.add.at(out, self._rows, np.einsum("kab,kb->ka", self._blocks, x[self._columns]))
+        above = np.einsum("kab,ka->kb", self._blocks[beside], x[self._rows[beside]])
+        np.add.at(out, self._columns[beside], above)
+        return out
+
+
+class _Sums:
+    """Sums of rows that have the same target, in the order of the rows."""
+
+    def __init__(self, targets: np.ndarray) -> None:
+        self._order = np.argsort(targets, kind="stable")
+        self.targets, self._starts = np.unique(targets[self._order], return_index=True)
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """The sums for `targets`."""
+        return np.add.reduceat(values[self._order], self._starts) if len(self._order) else values[:0]
