@@ -2,7 +2,7 @@
 
 from sfm.bundle.adjustment import adjust, squared_errors
 from sfm.bundle.covariance import BundleCovariance, covariance
-from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
+from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult, RigArrays
 from sfm.bundle.reconstruction import free_params_of, problem_from_reconstruction, update_reconstruction
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "BundleCovariance",
     "BundleProblem",
     "BundleResult",
+    "RigArrays",
     "adjust",
     "covariance",
     "free_params_of",

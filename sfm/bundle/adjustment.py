@@ -134,4 +134,5 @@ def _result(problem: BundleProblem, system: BundleSystem, summary: Summary, acti
         invalid=int(np.sum(~active)),
         lost=system.lost,
         table=summary.iterations,
+        biases=system.biases,
     )

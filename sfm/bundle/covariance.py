@@ -32,6 +32,7 @@ from scipy.linalg import get_lapack_funcs
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.bundle.adjustment import system_of
 from sfm.bundle.gauge import frame_centers
+from sfm.bundle.knowledge import motions_seen
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import BundleConfig, BundleProblem
 from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
@@ -162,6 +163,7 @@ def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
         unmoved = np.zeros((np.sum(~problem.rigs.free_sensors), 3, 7))
         unmoved[:, :, 6] = lengths[~problem.rigs.free_sensors]
         forbidden.append(unmoved.reshape(-1, 7))
+    forbidden += [motions_seen(problem, layout, tangents)]
     _, sizes, directions = np.linalg.svd(np.concatenate(forbidden))
     allowed = directions[sizes <= 1e-9 * max(float(sizes.max()), 1e-300)].T
     free = np.concatenate([tangents[layout.slot_frame], shared])

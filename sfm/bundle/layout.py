@@ -1,8 +1,9 @@
 """The order in which kernels see a problem.
 
 What is left after the elimination of points comes in rows of six (`sfm.core.optim.block_pattern`): first the poses of
-frames that may move, then *shared rows*: the free parameters of each camera, six to a row, and the poses of sensors
-that may move on their rig. A frame is what moves as one: the images of one moment of a rig, or a single image.
+frames that may move, then *shared rows*: the free parameters of each camera, six to a row, the poses of sensors that
+may move on their rig, and the biases of priors. A frame is what moves as one: the images of one moment of a rig, or
+a single image.
 
 Observations are kept in two orders. By images they are evaluated, many at once. By points, and within a point by the
 row (`slot`) of their frame, they are eliminated; those of frames that do not move come first there, with slot −1.
@@ -18,6 +19,7 @@ import itertools
 import numpy as np
 
 from sfm.bundle import _layout_kernels as kernels
+from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleProblem
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.execution import chunk_bounds
@@ -27,6 +29,8 @@ _OBSERVATIONS_PER_CHUNK = 8192
 _MAX_CHUNKS = 16
 SENSOR_COLUMN = MAX_PARAMS
 """Where the six columns of a sensor's tangent begin, behind those of the parameters."""
+BIAS_COLUMN = SENSOR_COLUMN + BLOCK
+"""Where the three of a bias begin."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -34,12 +38,14 @@ class SharedRows:
     """Rows behind those of poses, T of them.
 
     Attributes:
-        camera, sensor: (T,) whose row it is, −1 for no camera or no sensor.
-        columns: (T, 6) index of the parameter in each place, −1 for padding; sensors have `SENSOR_COLUMN` and on.
+        camera, sensor, bias: (T,) whose row it is, −1 in the two others.
+        columns: (T, 6) index of the parameter in each place, −1 for padding; sensors have `SENSOR_COLUMN` and on,
+            biases `BIAS_COLUMN` and on.
     """
 
     camera: np.ndarray
     sensor: np.ndarray
+    bias: np.ndarray
     columns: np.ndarray
 
     def __len__(self) -> int:
@@ -107,14 +113,15 @@ class Layout:
         """(rows, 6) places that are no unknowns."""
         return np.concatenate([np.zeros((len(self.slot_frame), BLOCK), bool), self.shared.columns < 0])
 
-    def pattern(self) -> BlockPattern:
-        """The blocks of S that points, images and shared rows fill."""
+    def pattern(self, rows: np.ndarray, columns: np.ndarray) -> BlockPattern:
+        """The blocks of S that points and images fill, and those in `rows` and `columns`, of the lower triangle."""
         marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)
         kernels.mark_pairs(self.starts, self.slot, self.shared_starts, self.shared_slot, marked)
         for k in range(self.image_shared.shape[1]):
             for other in (self.image_slot, *self.image_shared[:, :k].T):
                 both = (self.image_shared[:, k] >= 0) & (other >= 0)
                 kernels.mark(self.image_shared[both, k], other[both], marked)
+        kernels.mark(rows.astype(np.int32), columns.astype(np.int32), marked)
         return BlockPattern(*kernels.marked_blocks(marked))
 
     def row_ranges(self, parts: int) -> list[tuple[int, int]]:
@@ -220,25 +227,25 @@ def _changes(point: np.ndarray, slots: np.ndarray) -> np.ndarray:
 
 
 def _shared_rows(problem: BundleProblem, seen: np.ndarray) -> SharedRows:
-    """Rows for the cameras and sensors that have something free and that an observation sees."""
+    """Rows for the cameras and sensors that have something free and that an observation sees, and for biases."""
     used = np.bincount(problem.image_cameras[seen], minlength=len(problem.model_ids)) > 0
-    camera, sensor, columns = [], [], []
+    owners, columns = [], []
     for c in np.flatnonzero(used & problem.free_params.any(axis=1)):
         free = np.flatnonzero(problem.free_params[c])
         for k in range(0, len(free), BLOCK):
-            camera.append(c)
-            sensor.append(-1)
+            owners.append((c, -1, -1))
             columns.append(np.pad(free[k : k + BLOCK], (0, max(k + BLOCK - len(free), 0)), constant_values=-1))
     if problem.rigs is not None:
         mounted = problem.rigs.image_sensors[seen]
         used = np.bincount(mounted[mounted >= 0], minlength=len(problem.rigs.free_sensors)) > 0
         for q in np.flatnonzero(used & problem.rigs.free_sensors):
-            camera.append(-1)
-            sensor.append(q)
+            owners.append((-1, q, -1))
             columns.append(SENSOR_COLUMN + np.arange(BLOCK))
-    return SharedRows(
-        np.array(camera, np.int32), np.array(sensor, np.int32), np.array(columns, np.int32).reshape(-1, BLOCK)
-    )
+    for b in range(bias_count(problem.pose_priors)):
+        owners.append((-1, -1, b))
+        columns.append(np.array([BIAS_COLUMN, BIAS_COLUMN + 1, BIAS_COLUMN + 2, -1, -1, -1]))
+    camera, sensor, bias = np.array(owners, np.int32).reshape(-1, 3).T
+    return SharedRows(camera, sensor, bias, np.array(columns, np.int32).reshape(-1, BLOCK))
 
 
 def _rows_of_images(problem: BundleProblem, shared: SharedRows, poses: int) -> np.ndarray:
@@ -246,7 +253,8 @@ def _rows_of_images(problem: BundleProblem, shared: SharedRows, poses: int) -> n
     owned: list[list[int]] = [[] for _ in problem.model_ids]
     mounted: list[list[int]] = [[] for _ in (problem.rigs.free_sensors if problem.rigs else [])]
     for k, (c, q) in enumerate(zip(shared.camera, shared.sensor, strict=True)):
-        (owned[c] if c >= 0 else mounted[q]).append(poses + k)
+        if c >= 0 or q >= 0:
+            (owned[c] if c >= 0 else mounted[q]).append(poses + k)
     sensors = problem.rigs.image_sensors if problem.rigs else np.full(len(problem.image_cameras), -1)
     rows = [owned[c] + (mounted[q] if q >= 0 else []) for c, q in zip(problem.image_cameras, sensors, strict=True)]
     out = np.full((len(rows), max(map(len, rows), default=0)), -1, np.int32)

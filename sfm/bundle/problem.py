@@ -8,7 +8,8 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from sfm.core.arrays import Value, readonly
+from sfm.bundle.priors import PointPrior, Prior, check_rows
+from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -78,6 +79,7 @@ class BundleProblem(Value):
             of that; inf expects nothing, and so does None for all.
         rigs: where images were taken together; `cams_from_world` must be that of the rigs then, and a rig moves where
             all of its images may. None lets every image move by itself.
+        priors: what is known of poses and points besides.
 
     Raises:
         ValueError: shapes disagree, a row does not exist, a parameter that the model lacks is free, or a standard
@@ -99,6 +101,7 @@ class BundleProblem(Value):
     prior_sigmas: Float64[np.ndarray, "C K"] | None = None
     obs_sigmas: Float64[np.ndarray, " n"] | None = None
     rigs: RigArrays | None = None
+    priors: tuple[Prior | PointPrior, ...] = ()
 
     def __post_init__(self) -> None:
         cameras, images = len(self.model_ids), len(self.image_cameras)
@@ -131,9 +134,20 @@ class BundleProblem(Value):
             raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
         if self.rigs is not None:
             self._check_rigs(self.rigs)
+        check_rows(self.priors, images, points)
         _check_rows("image_cameras", self.image_cameras, cameras)
         _check_rows("obs_images", self.obs_images, images)
         _check_rows("obs_points", self.obs_points, points)
+
+    @property
+    def pose_priors(self) -> tuple[Prior, ...]:
+        """The priors that are about poses."""
+        return tuple(prior for prior in self.priors if not isinstance(prior, PointPrior))
+
+    @property
+    def point_priors(self) -> tuple[PointPrior, ...]:
+        """The priors that are about points."""
+        return tuple(prior for prior in self.priors if isinstance(prior, PointPrior))
 
     def _check_rigs(self, rigs: RigArrays) -> None:
         if len(rigs.image_frames) != len(self.image_cameras):
@@ -192,6 +206,7 @@ class BundleResult(Value):
         invalid: observations without a projection at the start (behind the camera, not finite); they take no part.
         lost: observations that lost their projection on the way; each is charged like the worst at the start.
         table: one row for each trial, the start first.
+        biases: (G, 3) of the groups of position priors that have one, in their order.
     """
 
     problem: BundleProblem
@@ -201,6 +216,7 @@ class BundleResult(Value):
     invalid: int
     lost: int
     table: tuple[Iteration, ...]
+    biases: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def iterations(self) -> int:

@@ -27,8 +27,7 @@ from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
 from sfm.core.optim.preconditioners import clusters_of, restricted_pattern
 from sfm.core.optim.schur import Couplings, eliminate, multiply
-from sfm.core.optim.solvers import Forecast, ReducedSolver, choose_solver
-from sfm.core.optim.sparse_cholesky import SparseCholesky
+from sfm.core.optim.solvers import Forecast, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
 
 _FLOOR = 1e-8
 """Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
@@ -41,42 +40,42 @@ _CLUSTER_ROWS = 60
 
 
 class SolverPlan(NamedTuple):
-    """What was chosen to solve the reduced system, and what it will take.
+    """What was chosen to solve the reduced system, before any of its memory is taken.
 
     Attributes:
         kind: dense, sparse or iterative.
-        pattern: the blocks of S that are formed; solver: what factors them.
+        pattern: the blocks of S that are formed; forecast: of what factors them.
         bytes: for S and its factor.
     """
 
     kind: SolverChoice
     pattern: BlockPattern
-    solver: ReducedSolver
+    forecast: Forecast
     bytes: int
 
 
-def plan_solver(layout: Layout, held: BoolArray, choice: SolverChoice) -> SolverPlan:
+def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: SolverChoice) -> SolverPlan:
     """Chooses a solver for the rows of `layout`, of whose unknowns (rows, 6) some are `held`."""
-    rows, unknowns = layout.rows, held.ravel()
-    if rows <= _FULL_ROWS and choice in ("auto", "dense"):
-        pattern = BlockPattern.full(rows)
-        solver, forecast = choose_solver(pattern, unknowns, "dense")
-        return _plan("dense", pattern, solver, forecast)
-    pattern = layout.pattern()
-    if choice == "iterative":
-        return _iterative(layout, pattern, unknowns)
-    solver, forecast = choose_solver(pattern, unknowns, choice)
-    kind = "sparse" if isinstance(solver, SparseCholesky) else "dense"
-    plan = _plan(kind, pattern, solver, forecast)
+    unknowns = held.ravel()
+    if layout.rows <= _FULL_ROWS and choice in ("auto", "dense"):
+        return _plan("dense", BlockPattern.full(layout.rows), forecast_dense(unknowns))
+    pattern = layout.pattern(terms.rows, terms.columns)
+    match choice:
+        case "dense":
+            return _plan("dense", pattern, forecast_dense(unknowns))
+        case "sparse":
+            return _plan("sparse", pattern, forecast_sparse(pattern, unknowns))
+        case "iterative":
+            return _iterative(layout, pattern, unknowns)
+    forecast = forecast_cheapest(pattern, unknowns)
+    plan = _plan(forecast.kind, pattern, forecast)
     couplings = len(layout.slot) + 3 * len(layout.shared_slot)
     too_slow = forecast.seconds > _PRODUCTS_PER_STEP * _PRODUCT_SECONDS_PER_COUPLING * couplings
-    if choice == "auto" and (too_slow or plan.bytes > machine_bytes() / 2):
-        return _iterative(layout, pattern, unknowns)
-    return plan
+    return _iterative(layout, pattern, unknowns) if too_slow or plan.bytes > machine_bytes() / 2 else plan
 
 
-def _plan(kind: SolverChoice, pattern: BlockPattern, solver: ReducedSolver, forecast: Forecast) -> SolverPlan:
-    return SolverPlan(kind, pattern, solver, forecast.bytes + 8 * BLOCK * WIDTH * len(pattern.columns))
+def _plan(kind: SolverChoice, pattern: BlockPattern, forecast: Forecast) -> SolverPlan:
+    return SolverPlan(kind, pattern, forecast, forecast.bytes + 8 * BLOCK * WIDTH * len(pattern.columns))
 
 
 def _iterative(layout: Layout, pattern: BlockPattern, unknowns: BoolArray) -> SolverPlan:
@@ -84,8 +83,7 @@ def _iterative(layout: Layout, pattern: BlockPattern, unknowns: BoolArray) -> So
     weights = np.zeros(len(pattern.columns))
     kernels.count_pairs(layout.starts, layout.slot, pattern.offsets, pattern.columns, weights)
     near, _ = restricted_pattern(pattern, clusters_of(pattern, weights, _CLUSTER_ROWS))
-    solver, forecast = choose_solver(near, unknowns, "sparse")
-    return _plan("iterative", near, solver, forecast)
+    return _plan("iterative", near, forecast_sparse(near, unknowns))
 
 
 class ReducedSystem:
@@ -96,20 +94,22 @@ class ReducedSystem:
         scaling: (rows, 6) λD of the last solution.
     """
 
-    def __init__(self, layout: Layout, held: BoolArray, couplings: Couplings, plan: SolverPlan, threads: int) -> None:
+    def __init__(
+        self, layout: Layout, held: BoolArray, couplings: Couplings, terms: RowTerms, plan: SolverPlan, threads: int
+    ) -> None:
         self.plan, self._layout, self._held, self._couplings, self._threads = plan, layout, held, couplings, threads
         self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
         self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
-        self._own = _OwnBlocks(layout, plan.pattern)
+        self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
+        self._own = _OwnBlocks(layout, terms, plan.pattern)
         self._ranges = layout.row_ranges(max(threads, 1))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
         self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
 
-    def take_over(self, images: ImageSums, priors: FloatArray, prior_gradient: FloatArray) -> None:
-        """Takes over a linearisation: the sums of images, and weights and gradient (T, 6) of priors on shared rows."""
-        self._own.set(images.F, images.G, priors)
-        self._own_gradient = self._own.gradient(images.h, images.f)
-        self._own_gradient[len(self._layout.slot_frame) :] += prior_gradient
+    def take_over(self, images: ImageSums, blocks: FloatArray, gradient: FloatArray) -> None:
+        """Takes over a linearisation: the sums of images, and blocks (m, 6, 6) and gradient (rows, 6) of the terms."""
+        self._own.set(images.F, images.G, blocks)
+        self._own_gradient = self._own.gradient(images.h, images.f) + gradient
         self.gradient = np.where(self._held, 0.0, self._own_gradient)
 
     def eliminate(self, centers: FloatArray, points3D: FloatArray, M: FloatArray, g: FloatArray) -> None:
@@ -136,17 +136,17 @@ class ReducedSystem:
     def solve(self, damping: float) -> FloatArray | None:
         """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
         self.scaling = damping * self._marquardt_diagonal()
-        if not self.plan.solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._threads):
+        if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._threads):
             return None
         side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
         if self.plan.kind == "iterative":
             found = conjugate_gradients(
-                self._multiplied, side, self.plan.solver.solve, model_tolerance=_MODEL_TOLERANCE,
+                self._multiplied, side, self._solver.solve, model_tolerance=_MODEL_TOLERANCE,
                 residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
             )  # fmt: skip
             delta = found.x if found.iterations else np.full(len(side), np.nan)
         else:
-            delta = self.plan.solver.solve(side)
+            delta = self._solver.solve(side)
         return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
 
     def matrix(self) -> FloatArray:
@@ -210,13 +210,20 @@ class ImageSums:
             part.fill(0)
 
 
+class RowTerms(NamedTuple):
+    """Which blocks of S priors contribute to: (m,) rows and columns, of the lower triangle."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+
+
 class _OwnBlocks:
     """What images and priors contribute to S and its gradient, whatever becomes of the points.
 
     But for the blocks of poses themselves, which the elimination adds.
     """
 
-    def __init__(self, layout: Layout, pattern: BlockPattern) -> None:
+    def __init__(self, layout: Layout, terms: RowTerms, pattern: BlockPattern) -> None:
         shared, slots = layout.image_shared, layout.image_slot
         self._images, self._most = shared.shape
         self._rows_count, self._place = layout.rows, layout.column_place
@@ -226,17 +233,16 @@ class _OwnBlocks:
         self._used = np.arange(layout.columns.shape[1]) < layout.column_count[:, None]
         images, k = np.nonzero(self._coupled)
         i, a, b = np.nonzero(self._both)
-        diagonal = len(layout.slot_frame) + np.arange(len(layout.shared), dtype=np.int64)
-        rows = np.concatenate([shared[images, k], shared[i, a], diagonal])
-        columns = np.concatenate([slots[images], shared[i, b], diagonal])
+        rows = np.concatenate([shared[images, k], shared[i, a], terms.rows])
+        columns = np.concatenate([slots[images], shared[i, b], terms.columns])
         self._sums = _Sums(rows.astype(np.int64) * layout.rows + columns)
         self._rows, self._columns = np.divmod(self._sums.targets, max(layout.rows, 1))
         self._numbers = pattern.find(self._rows, self._columns)
         self._gradients = _Sums(np.concatenate([slots[self._moving], shared[self._shared]]))
         self._blocks = np.zeros((len(self._rows), BLOCK, BLOCK))
 
-    def set(self, F: FloatArray, G: FloatArray, prior_weight: FloatArray) -> None:
-        """Takes over the sums of a linearisation, and the weights of the priors on parameters (T, 6)."""
+    def set(self, F: FloatArray, G: FloatArray, blocks: FloatArray) -> None:
+        """Takes over the sums of a linearisation, and the blocks (m, 6, 6) of the terms."""
         size = self._most * BLOCK
         wide, square = np.zeros((self._images, size, BLOCK)), np.zeros((self._images, size, size))
         image, k = np.nonzero(self._used)
@@ -248,8 +254,7 @@ class _OwnBlocks:
         square[image, a, b] = square[image, b, a] = values
         square = square.reshape(self._images, self._most, BLOCK, self._most, BLOCK).transpose(0, 1, 3, 2, 4)
         wide = wide.reshape(self._images, self._most, BLOCK, BLOCK)
-        priors = prior_weight[:, :, None] * np.eye(BLOCK)
-        self._blocks = self._sums.of(np.concatenate([wide[self._coupled], square[self._both], priors]))
+        self._blocks = self._sums.of(np.concatenate([wide[self._coupled], square[self._both], blocks]))
 
     def add(self, blocks: FloatArray) -> None:
         """Adds them to those blocks of the reduced system that are formed."""

@@ -10,7 +10,7 @@ A = ∂π/∂x, Q = ∂π/∂θ:
 
 with μ the tangent of a sensor's pose on its rig, on the left and in its own axes. Rows are scaled by √ρ'(|r|²), see
 `sfm.core.optim.losses`; how points are eliminated is in `sfm.core.optim.schur`, in which order in `layout`.
-A camera parameter that is expected to be θ₀ with standard deviation σ adds ½ ((θ − θ₀) / σ)².
+What priors add is in `knowledge`.
 Points are cut into chunks whose number depends on the problem alone and whose sums are added in order.
 """
 
@@ -23,7 +23,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from sfm.bundle import _kernels as kernels
-from sfm.bundle.layout import SENSOR_COLUMN, Layout
+from sfm.bundle.knowledge import Knowledge
+from sfm.bundle.layout import Layout
+from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
 from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
 from sfm.core.arrays import BoolArray, FloatArray
@@ -69,9 +71,9 @@ class BundleSystem:
             layout.starts, layout.slot, np.empty((len(layout.slot), 6)),
             layout.shared_starts, layout.shared_slot, np.empty((len(layout.shared_slot), 3, BLOCK)),
         )  # fmt: skip
-        plan = plan_solver(layout, self.held, config.solver)
-        self._reduced = ReducedSystem(layout, self.held, self._couplings, plan, threads)
-        self._expected, self._prior_weight = _priors(problem, layout)
+        self._known = Knowledge(problem, layout)
+        plan = plan_solver(layout, self.held, self._known.targets, config.solver)
+        self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, threads)
 
     @property
     def free_count(self) -> int:
@@ -81,8 +83,13 @@ class BundleSystem:
 
     @property
     def prior_count(self) -> int:
-        """Number of camera parameters that have a prior."""
-        return int(np.sum(self._prior_weight > 0))
+        """Number of scalars that a prior expects to be something."""
+        return self._known.count
+
+    @property
+    def biases(self) -> FloatArray:
+        """Current biases (G, 3) of position priors."""
+        return self._state.biases
 
     @property
     def points3D(self) -> FloatArray:
@@ -145,10 +152,14 @@ class BundleSystem:
                 links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
             )  # fmt: skip
 
-        cost = sum(self._run(images, lay.image_chunks)) + self._prior_cost(now.params)
+        cost = sum(self._run(images, lay.image_chunks))
         self._run(points, lay.point_chunks)
-        weight = self._prior_weight
-        self._reduced.take_over(sums, weight, weight * self._unexpected(now.params))
+        prior, blocks, gradient = self._known.linearize(now.images[2], now.centers, now.params, now.biases)
+        cost += prior
+        if self._known.is_about_points:
+            prior, V, g = self._known.linearize_points(now.points3D)
+            cost, self._V, self._g = cost + prior, self._V + V, self._g + g
+        self._reduced.take_over(sums, blocks, gradient)
         largest = max(np.abs(self._reduced.gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
         return float(cost), float(largest)
 
@@ -186,7 +197,7 @@ class BundleSystem:
         self._evaluate(then)
         self._run(settle, list(enumerate(lay.point_chunks)))
         cost, decrease, step, norm, lost = totals.sum(axis=0)
-        cost += self._prior_cost(then.params)
+        cost += self._known.cost(then.images[2], then.params, then.biases, then.points3D)
         then.lost = int(lost)
         decrease += 0.5 * float(np.sum(self._reduced.scaling * delta**2 - self._reduced.gradient * delta))
         norm += np.sum(centers**2) + len(centers) + np.sum(now.params**2)
@@ -212,13 +223,6 @@ class BundleSystem:
             )  # fmt: skip
 
         self._run(images, lay.image_chunks)
-
-    def _unexpected(self, params: FloatArray) -> FloatArray:
-        """θ − θ₀ (T, 6) of the free camera parameters that have a prior, 0 for the others."""
-        return np.where(self._prior_weight > 0, _values(params, self.layout) - self._expected, 0.0)
-
-    def _prior_cost(self, params: FloatArray) -> float:
-        return 0.5 * float(np.sum(self._prior_weight * self._unexpected(params) ** 2))
 
     def _eliminate(self, damping: float) -> None:
         """Inverts the blocks of points and takes them out of the reduced system."""
@@ -259,6 +263,7 @@ class _State:
     images: tuple[np.ndarray, np.ndarray, Rigid3]
     params: np.ndarray
     points3D: np.ndarray
+    biases: np.ndarray
     lost: int = 0
 
     @staticmethod
@@ -274,10 +279,11 @@ class _State:
             _as_arrays(poses),
             problem.camera_params.copy(),
             problem.points3D.copy(),
+            np.zeros((bias_count(problem.pose_priors), 3)),
         )
 
     def copy(self) -> _State:
-        copied = {name: getattr(self, name).copy() for name in ("wxyz", "centers", "params", "points3D")}
+        copied = {name: getattr(self, name).copy() for name in ("wxyz", "centers", "params", "points3D", "biases")}
         return dataclasses.replace(self, **copied)
 
     def move(self, delta: FloatArray, layout: Layout, then: _State) -> None:
@@ -291,6 +297,7 @@ class _State:
         row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
         cells = shared.camera[row], shared.columns[row, place]
         then.params[cells] = self.params[cells] + delta[poses + row, place]
+        then.biases[:] = self.biases + delta[poses + np.flatnonzero(shared.bias >= 0), :3]
         if self.rigs is None:
             then.images = _as_arrays(then.frames)
             return
@@ -320,18 +327,3 @@ def _shifted(sensors: Rigid3, moving: np.ndarray, delta: FloatArray) -> Rigid3:
     turns[moving] = (turn @ sensors.rotation[moving]).wxyz
     translations[moving] = turn @ translations[moving] + delta[:, 3:]
     return Rigid3(Rotation3(turns), translations)
-
-
-def _values(params: FloatArray, layout: Layout) -> FloatArray:
-    """(T, 6) the parameters in the places of the shared rows; anything where there is none."""
-    columns = np.where(layout.shared.columns < SENSOR_COLUMN, np.maximum(layout.shared.columns, 0), 0)
-    return params[np.maximum(layout.shared.camera, 0)[:, None], columns] if len(params) else np.zeros(columns.shape)
-
-
-def _priors(problem: BundleProblem, layout: Layout) -> tuple[FloatArray, FloatArray]:
-    """Expected values and inverse variances (T, 6) of the free parameters in the shared rows."""
-    if problem.prior_params is None or problem.prior_sigmas is None:
-        return np.zeros(layout.shared.columns.shape), np.zeros(layout.shared.columns.shape)
-    is_param = (layout.shared.columns >= 0) & (layout.shared.camera >= 0)[:, None]
-    weight = _values(problem.prior_sigmas, layout) ** -2.0
-    return _values(problem.prior_params, layout), np.where(is_param, weight, 0.0)

@@ -211,10 +211,10 @@ def _run(typing_context, C, c, A, a, n):
         inside = builder.icmp_signed("<", ir.Constant(lanes, list(range(TILE))), counts)
         module, pointer = builder.module, kind.as_pointer()
         load = cgutils.get_or_insert_function(
-            module, ir.FunctionType(kind, [pointer, _LANE, mask, kind]), "llvm.masked.load.v8f64.p0"
+            module, ir.FunctionType(kind, [pointer, _LANE, mask, kind]), "llvm.masked.load.v8f64.p0v8f64"
         )
         store = cgutils.get_or_insert_function(
-            module, ir.FunctionType(ir.VoidType(), [kind, pointer, _LANE, mask]), "llvm.masked.store.v8f64.p0"
+            module, ir.FunctionType(ir.VoidType(), [kind, pointer, _LANE, mask]), "llvm.masked.store.v8f64.p0v8f64"
         )
         zeros, place = ir.Constant(kind, [0.0] * TILE), _vector_at(builder, to, args[1])
         added = builder.call(load, [_vector_at(builder, of, args[3]), _LANE(8), inside, zeros])

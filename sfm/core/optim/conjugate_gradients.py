@@ -27,7 +27,7 @@ a preconditioner that is not positive definite."""
 Linear: TypeAlias = Callable[[FloatArray], FloatArray]
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Approximation:
     """An approximate solution (n,), always finite, the steps it took, why they ended, and |b − S x| / |b|."""
 

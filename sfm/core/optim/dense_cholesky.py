@@ -16,16 +16,20 @@ Reference:
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import chunk_bounds, ordered_map
 from sfm.core.optim import _cholesky_kernels as kernels
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
 
 STRIP = 8
 """Rows of a strip."""
-_SHARE_FROM = 150
+Count = TypeVar("Count", int, np.ndarray)
+SHARE_FROM = 100
 """Strips from which threads pay; handing out the work of a panel takes a third of a millisecond."""
 
 
@@ -57,7 +61,7 @@ class DenseCholesky:
         def scatter(rows: tuple[int, int]) -> None:
             kernels.scatter_blocks(*rows, blocks, pattern.offsets, pattern.columns, self._position, damping, L)
 
-        share = threads if strip_count(n) >= _SHARE_FROM else 1
+        share = threads if strip_count(n) >= SHARE_FROM else 1
         list(ordered_map(scatter, chunk_bounds(pattern.rows, share), threads=share))
         return factor_strips(L, strip_count(n), threads)
 
@@ -67,9 +71,16 @@ class DenseCholesky:
         x[self._free] = solve_strips(self._L, side[self._free])
         return x
 
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
+        Z = front_inverse(self._L, strip_count(len(self._free)), np.zeros((0, 0)))
+        row = np.repeat(np.arange(self._pattern.rows), np.diff(self._pattern.offsets))
+        position = self._position.reshape(-1, BLOCK)
+        return gathered_blocks(Z, position[row], position[self._pattern.columns])
 
-def strip_count(unknowns: int) -> int:
-    """Strips that hold so many rows."""
+
+def strip_count(unknowns: Count) -> Count:
+    """Strips that hold so many rows; for each number of an array too."""
     return -(-unknowns // STRIP)
 
 
@@ -98,7 +109,7 @@ def eliminate_panel(
         L: has the factor of the front at `at`; `pivots` of its `end` strips are eliminated in the end.
         rest: has the Schur complement of the others at `rest_at`.
     """
-    threads = threads if end - last >= _SHARE_FROM else 1
+    threads = threads if end - last >= SHARE_FROM else 1
 
     def below(rows: tuple[int, int]) -> None:
         kernels.factor_panel(L, at, pivots, first, last, *rows)

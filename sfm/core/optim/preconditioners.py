@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.optim import _preconditioner_kernels as kernels
+from sfm.core.optim import _iterative_kernels as kernels
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
 

@@ -30,7 +30,7 @@ _ALWAYS_DENSE_SHARE = 0.5
 _WORTH_SPARSE = 0.75
 """Of the time of a dense factor, below which a sparse one is taken: where they are close, it needs more memory."""
 _DENSE_SECONDS_PER_OPERATION, _DENSE_SECONDS_PER_ENTRY = 1.1e-11, 1.5e-9
-"""Measured on the core on which `ordering.front_seconds` was."""
+"""Measured on the core on which `that of the fronts` was."""
 
 
 @runtime_checkable
@@ -51,7 +51,7 @@ class ReducedSolver(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
     """What a solver takes for each factorisation, known before any of it is taken.
 
@@ -95,7 +95,7 @@ def forecast_cheapest(pattern: BlockPattern, held: BoolArray) -> Forecast:
     return sparse if sparse.seconds < _WORTH_SPARSE * dense.seconds else dense
 
 
-def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> ReducedSolver:
+def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> DenseCholesky | SparseCholesky:
     """The solver of a forecast for the same pattern and held unknowns (6N,); takes its memory."""
     if forecast.kind == "dense":
         return DenseCholesky(pattern, held)

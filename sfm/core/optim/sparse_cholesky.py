@@ -22,13 +22,15 @@ import numpy as np
 
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import ordered_map
-from sfm.core.optim import _cholesky_kernels
 from sfm.core.optim import _sparse_cholesky_kernels as kernels
+from sfm.core.optim._cholesky_kernels import PANEL, factor_panel
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
-from sfm.core.optim.dense_cholesky import eliminate_panel, strip_count
-from sfm.core.optim.ordering import STRIP, Fronts, find_fronts, strips_of
+from sfm.core.optim.dense_cholesky import SHARE_FROM, STRIP, eliminate_panel, strip_count
+from sfm.core.optim.ordering import Fronts, find_fronts
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
 
-_JOBS = 16
+_JOBS = 8
+"""Subtrees of about this part of the work; more would leave more fronts above them, which are done one by one."""
 _WORTH_SHARING_S = 5e-3
 """Seconds of a whole factorisation from which threads pay."""
 
@@ -82,12 +84,12 @@ class SparseCholesky:
     def __init__(self, pattern: BlockPattern, held: BoolArray, fronts: Fronts | None = None) -> None:
         fronts = find_fronts(pattern, held) if fronts is None else fronts
         schedule = _schedule(fronts)
-        self._free = _free_in_order(fronts, held)
+        self._free, self._blocks = _free_in_order(fronts, held), len(pattern.columns)
         self._plan = _plan(pattern, held, fronts, schedule.rest_at)
         self._jobs, self._top = schedule.jobs, schedule.top
         self._shared = fronts.seconds.sum() >= _WORTH_SHARING_S
         self._L, self._U = np.empty(int(self._plan.factor_at[-1])), np.empty(schedule.size)
-        largest = STRIP * (strips_of(fronts.pivots) + strips_of(fronts.rests))
+        largest = STRIP * (strip_count(fronts.pivots) + strip_count(fronts.rests))
         self._front = np.empty(int(largest.max(initial=0)))
 
     def factor(self, blocks: FloatArray, damping: FloatArray, threads: int = 1) -> bool:
@@ -105,17 +107,19 @@ class SparseCholesky:
             return all(map(subtree, [*self._jobs, self._top]))
         if not all(list(ordered_map(subtree, self._jobs, threads=threads))):
             return False
-        return all(self._factor_front(f, blocks, damping, threads) for f in self._top.tolist())
+        return all(self._factor_front(f, blocks, damping, threads) for f in self._top)
 
-    def _factor_front(self, f: int, blocks: FloatArray, damping: FloatArray, threads: int) -> bool:
-        """One front with its rows shared out among threads."""
+    def _factor_front(self, f: np.int64, blocks: FloatArray, damping: FloatArray, threads: int) -> bool:
+        """One front, with its rows shared out among threads if it is large."""
         plan, L, U = self._plan, self._L, self._U
-        kernels.assemble_front(f, plan, blocks, damping, L, U)
         at, rest, columns = int(plan.factor_at[f]), int(plan.rest_at[f]), strip_count(int(plan.pivots[f]))
         end = columns + strip_count(int(plan.rests[f]))
-        for first in range(0, columns, _cholesky_kernels.PANEL):
-            last = min(first + _cholesky_kernels.PANEL, columns)
-            if not _cholesky_kernels.factor_panel(L, at, columns, first, last, first, last):
+        if end < SHARE_FROM:
+            return kernels.factor_fronts(np.array([f]), plan, blocks, damping, L, U)
+        kernels.assemble_front(f, plan, blocks, damping, L, U)
+        for first in range(0, columns, PANEL):
+            last = min(first + PANEL, columns)
+            if not factor_panel(L, at, columns, first, last, first, last):
                 return False
             eliminate_panel(L, at, columns, end, first, last, U, rest, threads)
         return True
@@ -128,6 +132,29 @@ class SparseCholesky:
         x[self._free] = z
         return x
 
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
+        plan, blocks = self._plan, np.zeros((self._blocks, BLOCK, BLOCK))
+        below = {f: np.zeros((0, 0)) for f in np.flatnonzero(plan.rests == 0).tolist()}
+        for f in range(len(plan.pivots) - 1, -1, -1):
+            L = self._L[plan.factor_at[f] : plan.factor_at[f + 1]]
+            Z = front_inverse(L, strip_count(int(plan.pivots[f])), below.pop(f))
+            for child in plan.child[plan.children[f] : plan.children[f + 1]].tolist():
+                place = plan.place[plan.rest_starts[child] : plan.rest_starts[child + 1]]
+                below[child] = np.pad(Z[np.ix_(place, place)], (0, -len(place) % STRIP))
+            own = slice(plan.entries[f], plan.entries[f + 1])
+            blocks[plan.entry_block[own]] = _own_blocks(plan, own, Z)
+        return blocks
+
+
+def _own_blocks(plan: Plan, own: slice, Z: FloatArray) -> FloatArray:
+    """The blocks of a front's own entries of S in the inverse Z of the front."""
+    high, low, rank = plan.entry_high[own], plan.entry_low[own], plan.rank.reshape(-1, BLOCK)
+    rows = np.where(rank[high] >= 0, rank[high] + plan.entry_high_at[own, None], -1)
+    columns = np.where(rank[low] >= 0, rank[low] + plan.entry_low_at[own, None], -1)
+    blocks = gathered_blocks(Z, rows, columns)
+    return np.where((high < low)[:, None, None], blocks.transpose(0, 2, 1), blocks)
+
 
 def sparse_bytes(fronts: Fronts) -> int:
     """Memory that `SparseCholesky` takes for the numbers of these fronts."""
@@ -135,7 +162,14 @@ def sparse_bytes(fronts: Fronts) -> int:
 
 
 class _Schedule(NamedTuple):
-    """Subtrees that may be factored at the same time, the fronts above them, and where triangles lie."""
+    """Subtrees that may be factored at the same time, the fronts above them, and where triangles lie in U.
+
+    Attributes:
+        jobs: the fronts of one subtree or several, children before their parents.
+        top: the fronts above all of these.
+        rest_at: (F,) where the triangle of each front begins.
+        size: numbers in U.
+    """
 
     jobs: list[np.ndarray]
     top: np.ndarray
@@ -144,53 +178,62 @@ class _Schedule(NamedTuple):
 
 
 def _schedule(fronts: Fronts) -> _Schedule:
-    parent = fronts.parent.tolist()
-    work, first, depth = fronts.seconds, np.arange(len(parent)), np.zeros(len(parent), np.int64)
-    work = work.copy()
-    for f, up in enumerate(parent):
+    """Cuts the tree where the subtrees become small; what they leave over waits for the fronts above."""
+    parent, seconds = fronts.parent, fronts.seconds
+    work, first = seconds.copy(), np.arange(len(parent))
+    for f, up in enumerate(parent.tolist()):
         if up >= 0:
             work[up] += work[f]
             first[up] = min(first[up], first[f])
-    for f in range(len(parent) - 1, -1, -1):
-        depth[f] = depth[parent[f]] + 1 if parent[f] >= 0 else 0
-    share = fronts.seconds.sum() / _JOBS
+    share = seconds.sum() / _JOBS
     is_top = work > share
-    roots = [f for f, up in enumerate(parent) if not is_top[f] and (up < 0 or is_top[up])]
+    roots = np.flatnonzero(~is_top & ((parent < 0) | is_top[parent]))
     jobs: list[list[int]] = []
     room = 0.0
-    for root in roots:
+    for root in roots.tolist():
         if not jobs or work[root] > room:
             jobs.append([])
             room = share
         jobs[-1].extend(range(first[root], root + 1))
         room -= work[root]
-    top = np.flatnonzero(is_top)
-    size, rest_at, kept = 0, np.zeros(len(parent), np.int64), set(roots)
-    sizes = fronts.rest_sizes
-    for root in roots:
-        rest_at[root] = size
-        size += int(sizes[root])
-    # The fronts above come after all jobs, whose stacks are empty by then.
-    above = _stack(top.tolist(), parent, depth, sizes, kept, rest_at, size)
+    stacks, waiting = _Stacks(fronts, roots), int(fronts.rest_sizes[roots].sum())
+    size = waiting
     for job in jobs:
-        size = _stack(job, parent, depth, sizes, kept, rest_at, size)
-    return _Schedule([np.array(job, np.int64) for job in jobs], top, rest_at, max(size, above))
+        size = stacks.place(job, size)
+    # The stacks of the jobs are empty when the fronts above begin with theirs.
+    top = np.flatnonzero(is_top)
+    size = max(size, stacks.place(top.tolist(), waiting))
+    return _Schedule([np.array(job, np.int64) for job in jobs], top, stacks.rest_at, size)
 
 
-def _stack(job, parent, depth, sizes, kept, rest_at, begin) -> int:
-    """Puts the triangles of a job on two stacks from `begin` on, and returns where these end."""
-    tops, peaks, waiting, stack = [0, 0], [0, 0], {}, {}
-    for f in job:
-        side = depth[f] % 2
-        if f not in kept:
-            stack[f] = (side, tops[side])
-            tops[side] += int(sizes[f])
-            peaks[side] = max(peaks[side], tops[side])
-            waiting[parent[f]] = waiting.get(parent[f], 0) + int(sizes[f])
-        tops[1 - side] -= waiting.pop(f, 0)
-    for f, (side, at) in stack.items():
-        rest_at[f] = begin + at + (peaks[0] if side else 0)
-    return begin + peaks[0] + peaks[1]
+class _Stacks:
+    """Where triangles lie in U: first those of the `roots` of subtrees, which wait; then two stacks for each job."""
+
+    def __init__(self, fronts: Fronts, roots: np.ndarray) -> None:
+        parent, sizes = fronts.parent, fronts.rest_sizes
+        self.rest_at = np.zeros(len(parent), np.int64)
+        self.rest_at[roots] = np.cumsum(sizes[roots]) - sizes[roots]
+        self._depth = np.zeros(len(parent), np.int64)
+        for f in np.flatnonzero(parent >= 0)[::-1]:
+            self._depth[f] = self._depth[parent[f]] + 1
+        self._own = sizes.copy()
+        self._own[roots] = 0
+        self._of_children = np.zeros(len(parent), np.int64)
+        np.add.at(self._of_children, parent[parent >= 0], self._own[parent >= 0])
+
+    def place(self, job: list[int], begin: int) -> int:
+        """Places the triangles of a job's fronts from `begin` on, and returns where they end."""
+        heights, peaks, offsets = [0, 0], [0, 0], []
+        for f in job:
+            side = int(self._depth[f] % 2)
+            offsets.append(heights[side])
+            heights[side] += int(self._own[f])
+            peaks[side] = max(peaks[side], heights[side])
+            heights[1 - side] -= int(self._of_children[f])
+        for f, offset in zip(job, offsets, strict=True):
+            if self._own[f]:
+                self.rest_at[f] = begin + offset + (peaks[0] if self._depth[f] % 2 else 0)
+        return begin + sum(peaks)
 
 
 def _free_in_order(fronts: Fronts, held: BoolArray) -> np.ndarray:
@@ -204,7 +247,7 @@ def _plan(pattern: BlockPattern, held: BoolArray, fronts: Fronts, rest_at: np.nd
     rank = np.where(free, np.cumsum(free, axis=1) - 1, -1).astype(np.int32).ravel()
     sizes = free.sum(axis=1)[fronts.order]
     starts = np.concatenate([[0], np.cumsum(sizes)])
-    columns = STRIP * strips_of(fronts.pivots)
+    columns = STRIP * strip_count(fronts.pivots)
     count = len(fronts.pivots)
     place_of = np.full(pattern.rows, -1)
     place_of[fronts.order] = np.arange(len(fronts.order))

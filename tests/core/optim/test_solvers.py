@@ -83,7 +83,8 @@ def test_what_is_not_positive_definite_or_not_finite_has_no_factor(kind, rng):
 
 @exact
 def test_the_bits_do_not_depend_on_the_number_of_threads(kind, rng, monkeypatch):
-    monkeypatch.setattr(dense_cholesky, "_SHARE_FROM", 5)
+    monkeypatch.setattr(dense_cholesky, "SHARE_FROM", 5)
+    monkeypatch.setattr(sparse_cholesky, "SHARE_FROM", 5)
     monkeypatch.setattr(sparse_cholesky, "_WORTH_SHARING_S", 0.0)
     for pattern, S in (random_system(rng, 100, 800), random_system(rng, 150, 250)):
         n = 6 * pattern.rows
@@ -106,6 +107,23 @@ def test_badly_scaled_systems_are_solved_to_a_small_residual(kind, rng):
     assert solver.factor(lower_blocks(S, pattern), np.zeros(120), 1)
     scale = np.sqrt(np.diag(S))
     np.testing.assert_allclose((S @ solver.solve(side) - side) / scale, 0, atol=1e-9 * np.abs(side / scale).max())
+
+
+@exact
+@pytest.mark.parametrize("held_part", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize(("rows", "pairs"), [(0, 0), (1, 0), (9, 12), (40, 60), (60, 3000)])
+def test_blocks_of_the_inverse_equal_numpys(kind, rng, rows, pairs, held_part):
+    pattern, S = random_system(rng, rows, pairs)
+    held, damping = rng.random(6 * rows) < held_part, rng.random(6 * rows)
+    held[6:12] |= held_part > 0
+    solver = kind(pattern, held)
+    assert solver.factor(lower_blocks(S, pattern), damping, 1)
+    inverse = np.zeros_like(S)
+    free = np.flatnonzero(~held)
+    inverse[np.ix_(free, free)] = np.linalg.inv((S + np.diag(damping))[np.ix_(free, free)])
+    i = np.repeat(np.arange(rows), np.diff(pattern.offsets))
+    expected = inverse.reshape(rows, 6, rows, 6)[i, :, pattern.columns]
+    np.testing.assert_allclose(solver.inverse_blocks(), expected, rtol=0, atol=1e-12)
 
 
 def test_rows_on_their_own_are_solved_by_all_alike(rng):

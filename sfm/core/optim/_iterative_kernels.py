@@ -1,4 +1,4 @@
-"""Kernels of the preconditioners; see `preconditioners`."""
+"""Kernels of the iterative solution: preconditioners and products; see `preconditioners` and `block_product`."""
 
 from __future__ import annotations
 
@@ -65,3 +65,19 @@ def join_pairs(first, second, order, rows, largest):
     for i in range(rows):  # a parent has a smaller number, so it is final by now
         parent[i] = parent[parent[i]]
     return parent
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def add_product(first, last, blocks, offsets, columns, x, y):
+    """y += S x for the block rows `first:last` of the lower triangle and what mirrors them; x, y (N, 6)."""
+    for i in range(first, last):
+        for n in range(offsets[i], offsets[i + 1]):
+            j, block = columns[n], blocks[n]
+            for a in range(6):
+                total, factor = 0.0, x[i, a]
+                for b in range(a if i == j else 6):
+                    total += block[a, b] * x[j, b]
+                    y[j, b] += block[a, b] * factor
+                if i == j:
+                    total += block[a, a] * factor
+                y[i, a] += total

@@ -1,0 +1,174 @@
+"""Images that move together, and sensors that move on their rig."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, RigArrays, adjust, covariance
+from sfm.bundle.adjustment import system_of
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from tests.bundle.conftest import PARAMS, looking_inwards
+
+TIGHT = BundleConfig(relative_cost_tolerance=1e-13)
+SENSORS, FRAMES = 3, 5
+
+
+def build_rig(rng, noise_px=0.3, points=60, free_sensors=False, free_params=()):
+    """Five moments of a rig of three sensors, at the truth."""
+    camera = Camera("SIMPLE_RADIAL", 1000, 760, np.array(PARAMS["SIMPLE_RADIAL"]))
+    frames = looking_inwards(FRAMES, rng)
+    mounts = Rigid3.exp(np.concatenate([0.1 * rng.normal(size=(2, 3)), rng.uniform(0.3, 0.6, (2, 3))], axis=1))
+    rigs = RigArrays(
+        np.repeat(np.arange(FRAMES), SENSORS).astype(np.int32), np.tile([-1, 0, 1], FRAMES).astype(np.int32),
+        frames, mounts, np.full(2, free_sensors),
+    )  # fmt: skip
+    poses, points3D = rigs.cams_from_world, rng.uniform(-1.5, 1.5, (points, 3))
+    rows = np.argwhere(rng.random((points, len(poses))) < 0.7)
+    points2D, valid = camera.project(poses[rows[:, 1]] @ points3D[rows[:, 0]])
+    params, free = np.zeros((1, 12)), np.zeros((1, 12), bool)
+    params[0, :4], free[0, list(free_params)] = camera.params, True
+    return BundleProblem(
+        model_ids=np.array([camera.model_info.model_id], np.int32),
+        camera_params=params,
+        image_cameras=np.zeros(len(poses), np.int32),
+        cams_from_world=poses,
+        points3D=points3D,
+        obs_images=rows[valid, 1].astype(np.int32),
+        obs_points=rows[valid, 0].astype(np.int32),
+        obs_points2D=points2D[valid] + noise_px * rng.normal(size=(int(valid.sum()), 2)),
+        free_params=free,
+        free_poses=np.ones(len(poses), bool),
+        free_points=np.ones(points, bool),
+        rigs=rigs,
+    )
+
+
+def moved(problem, frames, sensors):
+    """The problem after steps of the frames in world axes and of the sensors on the left."""
+    rigs = rigs_of(problem)
+    rotation = rigs.rigs_from_world.rotation @ Rotation3.exp(frames[:, :3])
+    center = rigs.rigs_from_world.center - frames[:, 3:]
+    turn = Rotation3.exp(sensors[:, :3])
+    mounted = rigs.sensors_from_rig
+    rigs = dataclasses.replace(
+        rigs,
+        rigs_from_world=Rigid3(rotation, -(rotation @ center)),
+        sensors_from_rig=Rigid3(turn @ mounted.rotation, turn @ mounted.translation + sensors[:, 3:]),
+    )
+    return dataclasses.replace(problem, rigs=rigs, cams_from_world=rigs.cams_from_world)
+
+
+def rigs_of(problem):
+    assert problem.rigs is not None
+    return problem.rigs
+
+
+def disturbed(problem, rng, size=0.01):
+    frames = size * rng.normal(size=(FRAMES, 6))
+    sensors = size * rng.normal(size=(SENSORS - 1, 6)) * rigs_of(problem).free_sensors[:, None]
+    points3D = problem.points3D + size * rng.normal(size=problem.points3D.shape)
+    return dataclasses.replace(moved(problem, frames, sensors), points3D=points3D)
+
+
+def test_the_gradient_agrees_with_differences(rng):
+    problem = disturbed(build_rig(rng, free_sensors=True, free_params=(0, 3)), rng)
+    system, _ = system_of(problem, BundleConfig(gauge="free"), 1)
+    system.linearize()
+    gradient = system.gradient
+    assert len(gradient) == FRAMES + 1 + 2
+    for row, entry in [(0, 1), (2, 0), (3, 4), (4, 5), (6, 0), (6, 2), (7, 3), (7, 5)]:
+        costs = []
+        for sign in (1, -1):
+            step = np.zeros((FRAMES + 3, 6))
+            step[row, entry] = sign * 1e-6
+            near = moved(problem, step[:FRAMES], step[FRAMES + 1 :])
+            costs.append(system_of(near, BundleConfig(), 1)[0].linearize()[0])
+        assert (costs[0] - costs[1]) / 2e-6 == pytest.approx(gradient[row, entry], rel=1e-5, abs=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["dense", "sparse", "iterative"])
+@pytest.mark.parametrize("free_sensors", [True, False])
+def test_a_rig_finds_back_to_the_truth(rng, solver, free_sensors):
+    truth = build_rig(rng, noise_px=0.0, free_sensors=free_sensors, free_params=(0,))
+    result = adjust(disturbed(truth, rng), dataclasses.replace(TIGHT, solver=solver))
+    assert result.final_cost < 1e-12
+    found, expected = rigs_of(result.problem).sensors_from_rig, rigs_of(truth).sensors_from_rig
+    if free_sensors:
+        ratio = np.linalg.norm(found.translation[0]) / np.linalg.norm(expected.translation[0])
+        np.testing.assert_allclose(found.translation, ratio * expected.translation, atol=1e-5)
+    else:
+        assert np.array_equal(found.matrix, expected.matrix)
+        first, second = found_distance(result.problem), found_distance(truth)
+        assert first == pytest.approx(second, rel=1e-6)  # the rig sets the scale
+    composed = rigs_of(result.problem).cams_from_world
+    np.testing.assert_allclose(result.problem.cams_from_world.matrix, composed.matrix, atol=1e-12)
+
+
+def found_distance(problem):
+    centers = rigs_of(problem).rigs_from_world.center
+    return np.linalg.norm(centers[0] - centers[-1])
+
+
+def test_the_minimum_does_not_depend_on_threads(rng):
+    start = disturbed(build_rig(rng, free_sensors=True, points=400), rng)
+    first, second = adjust(start, threads=1), adjust(start, threads=3)
+    assert first.table == second.table
+    assert np.array_equal(first.problem.points3D, second.problem.points3D)
+
+
+def test_a_moment_with_a_constant_image_does_not_move(rng):
+    start = disturbed(build_rig(rng), rng)
+    free = np.ones(FRAMES * SENSORS, bool)
+    free[4] = False
+    found = adjust(dataclasses.replace(start, free_poses=free)).problem
+    frames, before = rigs_of(found).rigs_from_world, rigs_of(start).rigs_from_world
+    assert np.array_equal(frames[1].matrix, before[1].matrix)
+    assert np.abs(frames[2].matrix - before[2].matrix).max() > 1e-5
+
+
+def test_covariances_of_a_rig_are_those_of_repeated_adjustments(rng):
+    truth, noise = build_rig(rng, noise_px=0.0, free_sensors=True, points=50), 0.3
+    sigmas = np.full(len(truth.obs_images), noise)
+    predicted = covariance(dataclasses.replace(truth, obs_sigmas=sigmas))
+    assert isinstance(predicted, BundleCovariance)
+    tangents = []
+    for _ in range(200):
+        measured = truth.obs_points2D + noise * rng.normal(size=truth.obs_points2D.shape)
+        found = adjust(dataclasses.replace(truth, obs_points2D=measured)).problem
+        tangents.append((found.cams_from_world @ truth.cams_from_world.inverse()).log())
+    expected = np.einsum("iaa->ia", predicted.poses)
+    free = expected > 1e-6 * expected.max()
+    ratio = np.sqrt(np.mean(np.square(tangents), axis=0)[free] / expected[free])
+    assert 0.9 < np.median(ratio) < 1.1
+    free_gauge = covariance(dataclasses.replace(truth, obs_sigmas=sigmas), BundleConfig(gauge="free"))
+    assert isinstance(free_gauge, BundleCovariance)
+    assert np.trace(free_gauge.centers, axis1=1, axis2=2).sum() < np.trace(predicted.centers, axis1=1, axis2=2).sum()
+
+
+def test_a_sensor_that_nothing_determines_is_named(rng):
+    problem = build_rig(rng, free_sensors=True)
+    sensor = rigs_of(problem).image_sensors[problem.obs_images]
+    few = (sensor != 1) | ((problem.obs_points < 2) & (problem.obs_images == 2))
+    found = covariance(
+        dataclasses.replace(
+            problem,
+            obs_images=problem.obs_images[few],
+            obs_points=problem.obs_points[few],
+            obs_points2D=problem.obs_points2D[few],
+        )
+    )
+    assert isinstance(found, Rejected)
+    assert (found.reason, found.detail) == ("undetermined_sensor", "1")
+
+
+def test_poses_that_are_not_those_of_the_rig_are_refused(rng):
+    problem = build_rig(rng)
+    poses = Rigid3(problem.cams_from_world.rotation, problem.cams_from_world.translation + 0.1)
+    with pytest.raises(ValueError, match="rigs"):
+        dataclasses.replace(problem, cams_from_world=poses)
