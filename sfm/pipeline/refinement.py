@@ -37,7 +37,7 @@ class RefinementConfig:
     intrinsics: tuple[Intrinsics, ...] = ("focal", "extra")
     """Kinds of camera parameters that may change. The principal point is weakly determined by photos of a scene."""
     sensors: bool = False
-    """The poses of cameras on their rigs may change."""
+    """The poses of cameras on their rigs may change. Residuals alone move these; measurements move rigs as a whole."""
     poses: bool = True
     """Poses may change."""
     points: bool = True
