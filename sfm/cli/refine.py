@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -27,6 +27,7 @@ EXAMPLES = (
 )
 
 _FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="")
+_PX = tyro.conf.arg(metavar="PX", help_behavior_hint="")
 _UNITS = tyro.conf.arg(metavar="UNITS", help_behavior_hint="")
 _GPS_SIGMA_M = 5.0
 _KINDS: dict[str, Intrinsics] = {"focal": "focal", "pp": "principal_point", "distortion": "extra"}
@@ -55,6 +56,15 @@ class RefineOptions:
     """What of the cameras may change: focal, pp (the principal point), distortion, sensors (their poses on a rig), with
     commas; or none."""
 
+    focal_sigma: Annotated[float | None, _PX] = None
+    """Standard deviation with which the present focal lengths are known; without it they are not."""
+
+    pp_sigma: Annotated[float | None, _PX] = None
+    """The same of the principal points."""
+
+    distortion_sigma: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
+    """The same of each parameter of the distortion."""
+
     hold: Annotated[str, tyro.conf.arg(metavar="LIST", help_behavior_hint="")] = ""
     """What else may not change: poses, points."""
 
@@ -72,6 +82,9 @@ class RefineOptions:
 
     tolerance: Annotated[float, tyro.conf.arg(metavar="PART")] = 1e-8
     """Stop where a full step lowers the cost by less than this part."""
+
+    solver: Annotated[Literal["auto", "dense", "sparse", "iterative"], tyro.conf.arg(metavar="NAME")] = "auto"
+    """How the reduced system is solved: dense, sparse (factors), iterative (conjugate gradients); auto: the fastest."""
 
     positions: Annotated[Path | None, _FILE] = None
     """Where photos were taken: name,x,y,z or name,latitude,longitude,altitude; also sx,sy,sz."""
@@ -157,9 +170,13 @@ def main(words: Sequence[str]) -> int:
             graduated=options.graduated,
             max_iterations=options.max_iterations,
             relative_cost_tolerance=options.tolerance,
+            solver=options.solver,
         )
         config = RefinementConfig(
             intrinsics=tuple(_KINDS[kind] for kind in kinds if kind != _SENSORS),
+            focal_sigma=options.focal_sigma,
+            principal_point_sigma=options.pp_sigma,
+            distortion_sigma=options.distortion_sigma,
             sensors=_SENSORS in kinds,
             poses="poses" not in held,
             points="points" not in held,

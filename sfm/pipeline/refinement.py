@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,13 @@ from sfm.bundle import (
     BundleResult,
     adjust,
     covariance,
+    free_params_of,
     problem_from_reconstruction,
     squared_errors,
     update_reconstruction,
 )
 from sfm.bundle.reconstruction import Intrinsics
+from sfm.core.cameras import Camera
 from sfm.core.errors import InputError, Rejected
 from sfm.core.events import SILENT, Observer
 from sfm.core.geometry.similarity import Sim3
@@ -36,6 +39,12 @@ class RefinementConfig:
 
     intrinsics: tuple[Intrinsics, ...] = ("focal", "extra")
     """Kinds of camera parameters that may change. The principal point is weakly determined by photos of a scene."""
+    focal_sigma: float | None = None
+    """Standard deviation in px with which present focal lengths are known; None: they are not."""
+    principal_point_sigma: float | None = None
+    """The same of principal points, in px."""
+    distortion_sigma: float | None = None
+    """The same of each parameter of a distortion."""
     sensors: bool = False
     """The poses of cameras on their rigs may change. Residuals alone move these; measurements move rigs as a whole."""
     poses: bool = True
@@ -52,8 +61,10 @@ class RefinementConfig:
     """Of the samples by which positions are aligned."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.pixel_sigma < np.inf:
-            raise ValueError(f"pixel_sigma must be positive and finite, got {self.pixel_sigma}")
+        for name in ("pixel_sigma", "focal_sigma", "principal_point_sigma", "distortion_sigma"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -203,11 +214,31 @@ def _problem(model: Reconstruction, config: RefinementConfig, priors: ModelPrior
     problem = dataclasses.replace(
         problem, free_poses=problem.free_poses & config.poses, free_points=problem.free_points & config.points
     )
+    problem = _with_known_parameters(problem, list(model.cameras.values()), config)
     if config.pixel_sigma != 1:
         problem = dataclasses.replace(problem, obs_sigmas=np.full(len(problem.obs_images), config.pixel_sigma))
     if priors is None:
         return problem
     return dataclasses.replace(problem, priors=(*priors.of_poses, *priors.of_points))
+
+
+def _with_known_parameters(
+    problem: BundleProblem, cameras: Sequence[Camera], config: RefinementConfig
+) -> BundleProblem:
+    """The problem with its camera parameters expected to be what they are, where the config says how certainly."""
+    sigmas: dict[Intrinsics, float | None] = {
+        "focal": config.focal_sigma,
+        "principal_point": config.principal_point_sigma,
+        "extra": config.distortion_sigma,
+    }
+    known = np.full(problem.camera_params.shape, np.inf)
+    for row, camera in zip(known, cameras, strict=True):
+        for kind, sigma in sigmas.items():
+            if sigma is not None:
+                row[free_params_of(camera.model_info, (kind,))] = sigma
+    if np.all(np.isinf(known)):
+        return problem
+    return dataclasses.replace(problem, prior_params=problem.camera_params, prior_sigmas=known)
 
 
 def _frame(

@@ -88,8 +88,20 @@ def test_the_noise_is_found_and_the_focal_length_is_as_certain_as_it_claims(dist
     assert np.sqrt(2 * refined.result.final_cost / count) == pytest.approx(NOISE_PX, rel=0.15)
 
 
+def test_parameters_that_are_known_stay_near(disturbed):
+    model = read_model(disturbed)
+    known = RefinementConfig(intrinsics=("focal", "principal_point"), focal_sigma=1e-3, principal_point_sigma=1e-3)
+    camera = refine_model(model, known).reconstruction.cameras[1]
+    np.testing.assert_allclose(camera.params[:3], model.cameras[1].params[:3], atol=0.1)
+    vaguely = dataclasses.replace(known, focal_sigma=1e3)
+    assert refine_model(model, vaguely).reconstruction.cameras[1].params[0] < model.cameras[1].params[0] - 5
+    with pytest.raises(ValueError, match="focal_sigma must be positive"):
+        RefinementConfig(focal_sigma=0.0)
+
+
 def test_a_summary_says_whether_it_has_converged(sfm, disturbed, tmp_path):
-    result = sfm("refine", disturbed, "-o", "one", "--max-iterations", "1", "--loss", "soft_l1", "--text")
+    words = ("--max-iterations", "1", "--loss", "soft_l1", "--solver", "dense", "--text")
+    result = sfm("refine", disturbed, "-o", "one", *words)
     assert result.returncode == 0, result.stderr
     assert "NOT CONVERGED" in result.stdout
     assert (tmp_path / "one" / "cameras.txt").exists()
