@@ -157,7 +157,7 @@ def race(problem: BundleProblem, rules: Rules, repeats: int, with_ceres: bool) -
     cost = _cost(their_errors, rules)
     ceres = Side(
         cost=cost, seconds=statistics.median(theirs),
-        iterations=summary.num_successful_steps + summary.num_unsuccessful_steps - 1, reason=_reason(summary),
+        iterations=summary.num_linear_solves, reason=_reason(summary),  # the last, too small trial is in no table
         without_projection=int(np.isnan(their_errors).sum()),
     )  # fmt: skip
     return Outcome(

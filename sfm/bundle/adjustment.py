@@ -63,31 +63,33 @@ def adjust(
 
 def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tuple[BundleSystem, BoolArray]:
     """The normal equations of `problem`, and which observations (n,) take part."""
-    squared = squared_errors(problem)
-    active = np.isfinite(squared)
+    active = np.ones(len(problem.obs_images), bool)
+    system = _laid_out(problem, active, config, threads)
+    valid = np.isfinite(system.evaluate(_TRIVIAL))
+    if not valid.all():
+        active[system.layout.original[~valid]] = False
+        system = _laid_out(problem, active, config, threads)
+        system.evaluate(_TRIVIAL)
+    worst = max(_LOST_PX**2, float(system.costs.max(initial=0.0)))
+    system.lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
+    return system, active
+
+
+def _laid_out(problem: BundleProblem, active: BoolArray, config: BundleConfig, threads: int) -> BundleSystem:
     layout = lay_out(problem, active)
     held = np.zeros((len(layout.slot_frame), 6), bool)
     if config.gauge == "two_cameras":
         held = held_by_two_cameras(problem, layout)
-    weighted = squared[active] if problem.obs_sigmas is None else squared[active] / problem.obs_sigmas[active] ** 2
-    worst = max(_LOST_PX**2, float(weighted.max(initial=0.0)))
-    lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
-    return BundleSystem(problem, layout, held, config, lost_cost, threads), active
+    return BundleSystem(problem, layout, held, config, threads)
 
 
 def squared_errors(problem: BundleProblem) -> FloatArray:
     """|projected − observed|² of every observation (n,) in px²; NaN where there is no projection."""
-    # Cameras go to all kernels as int64 and writable, so that projection is compiled once.
-    model_ids, params = problem.model_ids.astype(np.int64), problem.camera_params.copy()
-    rows = np.arange(len(problem.obs_images), dtype=np.int32)
-    by_image, offsets = sort_rows(rows, problem.obs_images, len(problem.image_cameras))
-    out = np.empty(len(rows))
-    kernels.costs_of_images(
-        0, len(problem.image_cameras), offsets, problem.obs_points[by_image], by_image, problem.obs_points2D[by_image],
-        np.ones(len(rows)), problem.image_cameras.copy(), model_ids, kernels.squared_limits(model_ids, params),
-        problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation, params,
-        problem.points3D.copy(), loss_id("trivial"), 1.0, out,
-    )  # fmt: skip
+    every = np.ones(len(problem.obs_images), bool)
+    nothing = {"free_params": np.zeros_like(problem.free_params), "free_poses": np.zeros_like(problem.free_poses)}
+    problem = dataclasses.replace(problem, obs_sigmas=None, priors=(), **nothing)
+    layout, out = lay_out(problem, every), np.empty(len(every))
+    out[layout.original] = BundleSystem(problem, layout, np.zeros((0, 6), bool), BundleConfig(), 1).evaluate(_TRIVIAL)
     return out
 
 

@@ -151,22 +151,22 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
     if np.any(image_slot[1:] < image_slot[:-1]):
         by_slot, _ = kernels.sort_rows(by_image, image_slot[problem.obs_images] + 1, len(slot_frame) + 1)
     by_point, offsets = kernels.sort_rows(by_slot, problem.obs_points, points)
-    image = problem.obs_images[by_point]
-    point, slots = np.repeat(np.arange(points), np.diff(offsets)), image_slot[image]
+    image = problem.obs_images.take(by_point)
+    point, slots = np.repeat(np.arange(points), np.diff(offsets)), image_slot.take(image)
     place, source = _from_one_order_to_another(by_image, by_point, len(active))
 
     shared = _shared_rows(problem, seen)
     image_shared = _rows_of_images(problem, shared, len(slot_frame))
     columns, column_place, column_count = _columns(shared, image_shared - len(slot_frame))
     obs_shared, shared_point, shared_slot = _shared_couplings(
-        point, image_shared[image], problem.free_points, len(slot_frame) + len(shared)
+        point, image_shared.take(image, axis=0), problem.free_points, len(slot_frame) + len(shared)
     )
-    moves = np.flatnonzero((slots >= 0) & _changes(point, slots))
+    couples = (slots >= 0) & _changes(point, slots)
     chunks = int(np.clip(len(point) // _OBSERVATIONS_PER_CHUNK, 1, _MAX_CHUNKS))
     return Layout(
         image_offsets=image_offsets,
-        image_point=problem.obs_points[by_image],
-        observed=problem.obs_points2D[by_image],
+        image_point=problem.obs_points.take(by_image),
+        observed=problem.obs_points2D.take(by_image, axis=0),
         precision=np.ones(len(by_image)) if problem.obs_sigmas is None else 1 / problem.obs_sigmas[by_image],
         place=place,
         offsets=offsets,
@@ -182,9 +182,9 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         column_count=column_count,
         columns=columns,
         column_place=column_place,
-        starts=np.searchsorted(point[moves], np.arange(points + 1)),
-        slot=slots[moves],
-        shared_starts=np.searchsorted(shared_point, np.arange(points + 1)),
+        starts=_offsets(point[couples], points),
+        slot=slots[couples],
+        shared_starts=_offsets(shared_point, points),
         shared_slot=shared_slot,
         obs_shared=obs_shared,
         point_chunks=_even_ranges(offsets, chunks),
@@ -196,7 +196,7 @@ def _from_one_order_to_another(first: np.ndarray, second: np.ndarray, count: int
     """Where the rows of one order (of some of `count` rows) stand in another, and the inverse."""
     position = np.empty(count, np.int32)
     position[second] = np.arange(len(second), dtype=np.int32)
-    place = position[first]
+    place = position.take(first)
     source = np.empty_like(place)
     source[place] = np.arange(len(place), dtype=np.int32)
     return place, source
@@ -289,6 +289,11 @@ def _shared_couplings(
         unique, inverse = np.unique(keys, return_inverse=True)
     coupling[takes_part] = inverse
     return coupling, unique // max(count, 1), (unique % max(count, 1)).astype(np.int32)
+
+
+def _offsets(point: np.ndarray, points: int) -> np.ndarray:
+    """(points + 1,) where each point begins among sorted ones."""
+    return np.concatenate([[0], np.cumsum(np.bincount(point, minlength=points))])
 
 
 def _even_ranges(offsets: np.ndarray, chunks: int) -> list[tuple[int, int]]:

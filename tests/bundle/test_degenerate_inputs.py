@@ -165,6 +165,7 @@ CASES: dict[str, Degenerate] = {
     "NaN in all points": with_value("points3D", slice(None), np.nan),
     "an infinite point": with_value("points3D", (3, 0), np.inf),
     "NaN in a pose": with_translation(np.nan),
+    "an infinite pose": with_translation(np.inf),
     "a pose far away": with_translation(1e100),
     "NaN in an observation": with_value("obs_points2D", 3, np.nan),
     "an observation far outside": with_value("obs_points2D", 3, 1e9),
@@ -213,7 +214,7 @@ def test_adjustment_ends_with_numbers(name, gauge, free_params, rng):
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "tukey", "truncated"])
-@pytest.mark.parametrize("name", ["a point at the centre of a camera", "an observation far outside", "NaN in a point"])
+@pytest.mark.parametrize("name", ["a point at the centre of a camera", "an observation at 1e200", "NaN in a point"])
 def test_graduated_losses_end_with_numbers(name, loss, rng):
     start = case(name, rng, (0, 1))
     result = adjust(start, BundleConfig(loss=loss, graduated=True, max_iterations=20))
