@@ -7,16 +7,14 @@ import math
 
 import numpy as np
 
-from sfm.bundle import _kernels as kernels
-from sfm.bundle._layout_kernels import sort_rows
-from sfm.bundle.gauge import held_by_two_cameras
+from sfm.bundle.gauge import held_by_two_cameras, put_back
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
 from sfm.bundle.system import BundleSystem
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.events import SILENT, BundleAdjusted, Observer
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
-from sfm.core.optim.losses import evaluate_loss, loss_id
+from sfm.core.optim.losses import evaluate_loss
 
 _LOST_PX = 100.0
 _GRADUAL_STEPS, _MAX_HALVINGS = 5, 20
@@ -33,19 +31,25 @@ def adjust(
     projection that it would keep where it is; an observation that loses its own all the same, because its camera
     moved, is charged like the worst at the start (at least 100 px).
 
+    The scene is free to turn, move and grow on the way, which takes fewer steps than to hold some of its poses; with
+    the gauge `two_cameras` it is put back in the end, see `gauge`.
+
     If `config.graduated`, the costs and the table are those of the last scale.
 
     Args:
         threads: the result is the same to the last bit for any number.
         scope: passed on to the event, e.g. "local".
     """
+    free, start = dataclasses.replace(config, gauge="free"), problem
     for scale in _wider_scales(problem, config):
-        wider = dataclasses.replace(config, loss_scale_px=scale, max_iterations=_GRADUAL_STEPS)
+        wider = dataclasses.replace(free, loss_scale_px=scale, max_iterations=_GRADUAL_STEPS)
         system, _ = system_of(problem, wider, threads)
         _minimize(system, wider)
         problem = _moved(problem, system)
-    system, active = system_of(problem, config, threads)
-    result = _result(problem, system, _minimize(system, config), active)
+    system, active = system_of(problem, free, threads)
+    result = _result(problem, system, _minimize(system, free), active)
+    if config.gauge == "two_cameras" and any(row.accepted for row in result.table[1:]):
+        result = dataclasses.replace(result, problem=put_back(start, result.problem, system.layout))
     observer(
         BundleAdjusted(
             scope=scope,
@@ -63,13 +67,14 @@ def adjust(
 
 def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tuple[BundleSystem, BoolArray]:
     """The normal equations of `problem`, and which observations (n,) take part."""
-    active = np.ones(len(problem.obs_images), bool)
+    poses = problem.cams_from_world
+    active = np.isfinite(np.c_[poses.rotation.wxyz, poses.translation]).all(axis=1)[problem.obs_images]
     system = _laid_out(problem, active, config, threads)
-    valid = np.isfinite(system.evaluate(_TRIVIAL))
+    valid = np.isfinite(system.evaluate("trivial"))
     if not valid.all():
         active[system.layout.original[~valid]] = False
         system = _laid_out(problem, active, config, threads)
-        system.evaluate(_TRIVIAL)
+        system.evaluate("trivial")
     worst = max(_LOST_PX**2, float(system.costs.max(initial=0.0)))
     system.lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
     return system, active
@@ -89,7 +94,7 @@ def squared_errors(problem: BundleProblem) -> FloatArray:
     nothing = {"free_params": np.zeros_like(problem.free_params), "free_poses": np.zeros_like(problem.free_poses)}
     problem = dataclasses.replace(problem, obs_sigmas=None, priors=(), **nothing)
     layout, out = lay_out(problem, every), np.empty(len(every))
-    out[layout.original] = BundleSystem(problem, layout, np.zeros((0, 6), bool), BundleConfig(), 1).evaluate(_TRIVIAL)
+    out[layout.original] = BundleSystem(problem, layout, np.zeros((0, 6), bool), BundleConfig(), 1).evaluate("trivial")
     return out
 
 
@@ -111,7 +116,7 @@ def _wider_scales(problem: BundleProblem, config: BundleConfig) -> list[float]:
         return []
     sigmas = 1.0 if problem.obs_sigmas is None else problem.obs_sigmas
     squared = squared_errors(problem) / sigmas**2
-    worst = math.sqrt(float(np.nanmax(squared, initial=0.0)))
+    worst = math.sqrt(float(squared[np.isfinite(squared)].max(initial=0.0)))
     halvings = min(max(math.ceil(math.log2(max(worst / config.loss_scale_px, 1.0))), 0), _MAX_HALVINGS)
     return [config.loss_scale_px * 2.0**k for k in range(halvings, 0, -1)]
 

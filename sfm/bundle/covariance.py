@@ -150,6 +150,7 @@ def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
     tangents[:, 3:, :3] = skew(centers)
     tangents[:, 3:, 3:6] = -np.eye(3)
     tangents[:, 3:, 6] = -centers
+    tangents[~np.isfinite(centers).all(axis=1)] = 0
     seen = np.bincount(layout.image_frame[layout.image], minlength=len(centers)) > 0
     constant = np.unique(layout.point[~problem.free_points[layout.point]])
     fixed = np.concatenate([-skew(points[constant]), np.broadcast_to(np.eye(3), (len(constant), 3, 3)),

@@ -1,4 +1,7 @@
-"""The seven motions of the whole scene that no observation sees, and how an adjustment holds them.
+"""The seven motions of the whole scene that no observation sees, and how they are held.
+
+A covariance needs them held, and so does a user who compares models. An adjustment is faster without: its steps are
+free, and a similarity puts the scene back in the end (`put_back`).
 
 Rotating, moving and scaling the world together with all cameras changes no residual. Holding the pose of one frame
 takes six of the seven freedoms. Scaling about that frame's centre then moves a second one along their baseline:
@@ -9,32 +12,45 @@ less is held: see `prior_gauge`.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from sfm.bundle.layout import Layout
 from sfm.bundle.prior_gauge import entries_to_hold
 from sfm.bundle.problem import BundleProblem
 from sfm.core.arrays import BoolArray, FloatArray
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from sfm.core.geometry.similarity import Sim3
 
 
 def held_by_two_cameras(problem: BundleProblem, layout: Layout) -> BoolArray:
     """(S, 6) tangent entries of the moving poses to hold; none where the constant parts fix the gauge already."""
     held = np.zeros((len(layout.slot_frame), 6), bool)
-    frame = layout.image_frame[layout.image]
-    seen = np.bincount(frame, minlength=len(layout.frame_slot))
-    constant = np.flatnonzero((layout.frame_slot < 0) & (seen > 0))
-    constant_points = np.unique(layout.point[~problem.free_points[layout.point]])
-    if not len(held) or len(constant) >= 2 or len(constant_points) >= 3:
+    chosen = _anchor_and_second(problem, layout)
+    if chosen is None:
         return held
-    anchor = int(constant[0]) if len(constant) else int(np.argmax(seen))
-    second = None if _scale_is_seen(problem, layout) else _second_frame(problem, layout, frame, anchor)
+    anchor, second = chosen
     centers = frame_centers(problem)
     entries = _entries(problem, centers[anchor], centers[second] if second is not None else None)
-    if not len(constant):
+    if layout.frame_slot[anchor] >= 0:
         held[layout.frame_slot[anchor]] = entries[0]
     if second is not None:
         held[layout.frame_slot[second]] = entries[1]
     return held
+
+
+def _anchor_and_second(problem: BundleProblem, layout: Layout) -> tuple[int, int | None] | None:
+    """The frame that holds the pose of the scene, and one that holds its size; None where constant parts do."""
+    frame = layout.image_frame[layout.image]
+    seen = np.bincount(frame, minlength=len(layout.frame_slot))
+    constant = np.flatnonzero((layout.frame_slot < 0) & (seen > 0))
+    constant_points = np.unique(layout.point[~problem.free_points[layout.point]])
+    if not len(layout.slot_frame) or len(constant) >= 2 or len(constant_points) >= 3:
+        return None
+    anchor = int(constant[0]) if len(constant) else int(np.argmax(seen))
+    return anchor, None if _scale_is_seen(problem, layout) else _second_frame(problem, layout, frame, anchor)
 
 
 def _entries(problem: BundleProblem, anchor: FloatArray, second: FloatArray | None) -> tuple[BoolArray, BoolArray]:
@@ -49,9 +65,58 @@ def _entries(problem: BundleProblem, anchor: FloatArray, second: FloatArray | No
     return np.ones(6, bool), of_second
 
 
+def put_back(before: BundleProblem, after: BundleProblem, layout: Layout) -> BundleProblem:
+    """`after`, moved as a whole so that it agrees with `before` in what `held_by_two_cameras` holds.
+
+    Left as it is where something else holds it: constant points, more than one constant pose, priors.
+    """
+    chosen = _anchor_and_second(before, layout)
+    if before.priors or chosen is None or not before.free_points[layout.point].all():
+        return after
+    anchor, second = chosen
+    old, new = _frames(before), _frames(after)
+    turn, scale = old[anchor].rotation.inverse() @ new[anchor].rotation, 1.0
+    if second is not None:
+        baseline, here = old[second].center - old[anchor].center, turn @ (new[second].center - new[anchor].center)
+        axis = int(np.argmax(np.abs(baseline)))
+        # The coordinate that is held, unless the second camera has gone far astray.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            scale = float(baseline[axis] / here[axis])
+            if not 0.1 < scale < 10:
+                scale = float(np.linalg.norm(baseline) / np.linalg.norm(here))
+    if not 0 < scale < np.inf:
+        return after
+    shift = old[anchor].center - scale * (turn @ new[anchor].center)
+    return _transformed(after, layout, old, anchor, Sim3(np.array(scale), turn, shift))
+
+
+def _transformed(problem: BundleProblem, layout: Layout, old: Rigid3, anchor: int, motion: Sim3) -> BundleProblem:
+    """The observed parts of the problem, moved; the anchor as it was, to the last bit."""
+    frames, moving = _frames(problem), layout.slot_frame
+    turns, translations = frames.rotation.wxyz.copy(), frames.translation.copy()
+    turned = frames[moving].rotation @ motion.rotation.inverse()
+    turns[moving] = turned.wxyz
+    translations[moving] = -(turned @ (motion @ frames[moving].center))
+    turns[anchor], translations[anchor] = old.rotation.wxyz[anchor], old.translation[anchor]
+    frames, points3D = Rigid3(Rotation3(turns), translations), problem.points3D.copy()
+    seen = np.diff(layout.offsets) > 0
+    points3D[seen] = motion @ points3D[seen]
+    if problem.rigs is None:
+        return dataclasses.replace(problem, cams_from_world=frames, points3D=points3D)
+    sensors = problem.rigs.sensors_from_rig
+    lengths = np.where(problem.rigs.free_sensors, float(motion.scale), 1.0)
+    sensors = Rigid3(sensors.rotation, lengths[:, None] * sensors.translation)
+    rigs = dataclasses.replace(problem.rigs, rigs_from_world=frames, sensors_from_rig=sensors)
+    return dataclasses.replace(problem, cams_from_world=rigs.cams_from_world, points3D=points3D, rigs=rigs)
+
+
+def _frames(problem: BundleProblem) -> Rigid3:
+    return problem.cams_from_world if problem.rigs is None else problem.rigs.rigs_from_world
+
+
 def frame_centers(problem: BundleProblem) -> FloatArray:
     """(F, 3) the centres of the frames in the world."""
-    return (problem.cams_from_world if problem.rigs is None else problem.rigs.rigs_from_world).center
+    return _frames(problem).center
 
 
 def _scale_is_seen(problem: BundleProblem, layout: Layout) -> bool:

@@ -57,6 +57,7 @@ class Layout:
     """The sorted problem; see the module.
 
     Attributes:
+        original: (n,) the observation of the problem that stands in each place of the order by points.
         image_offsets: (I + 1,) observations of each image; image_point, observed, precision their columns in this
             order, place (n,) where each stands in the order by points.
         offsets: (P + 1,) observations of each point; image, obs_slot their columns in this order, source (n,) where
@@ -72,6 +73,7 @@ class Layout:
         point_chunks, image_chunks: ranges of points and of images with about the same number of observations.
     """
 
+    original: np.ndarray
     image_offsets: np.ndarray
     image_point: np.ndarray
     observed: np.ndarray
@@ -164,6 +166,7 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
     couples = (slots >= 0) & _changes(point, slots)
     chunks = int(np.clip(len(point) // _OBSERVATIONS_PER_CHUNK, 1, _MAX_CHUNKS))
     return Layout(
+        original=by_point,
         image_offsets=image_offsets,
         image_point=problem.obs_points.take(by_image),
         observed=problem.obs_points2D.take(by_image, axis=0),

@@ -13,6 +13,7 @@ fit into half of the machine's memory.
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -105,6 +106,7 @@ class ReducedSystem:
         self._ranges = layout.row_ranges(max(threads, 1))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
         self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
+        self._gradient_of_points = np.zeros((0, 3))
 
     def take_over(self, images: ImageSums, blocks: FloatArray, gradient: FloatArray) -> None:
         """Takes over a linearisation: the sums of images, and blocks (m, 6, 6) and gradient (rows, 6) of the terms."""
@@ -119,19 +121,14 @@ class ReducedSystem:
             centers: (S, 3) of the frames by row.
             M, g: inverse damped blocks (P, 6) and gradients (P, 3) of the points.
         """
-        pattern, self._points = self.plan.pattern, (centers, points3D, M)
+        self._points = (centers, points3D, M)
         self._blocks.fill(0)
         self._own.add(self._blocks)
         self._side[:, :BLOCK] = -self._own_gradient
         self._diagonal[:] = self._own.diagonal
 
-        def rows(job: tuple[int, int]) -> None:
-            eliminate(
-                *job, *self._couplings, *self._points, g,
-                pattern.offsets, pattern.columns, self._blocks, self._side, self._diagonal,
-            )  # fmt: skip
-
-        list(ordered_map(rows, self._ranges, threads=self._threads))
+        self._gradient_of_points = g
+        list(ordered_map(self._eliminate_rows, self._ranges, threads=self._threads))
 
     def solve(self, damping: float) -> FloatArray | None:
         """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
@@ -158,18 +155,26 @@ class ReducedSystem:
         lower = np.tril(S.transpose(0, 2, 1, 3).reshape(BLOCK * size, BLOCK * size))
         return lower + np.tril(lower, -1).T
 
+    def _eliminate_rows(self, rows: tuple[int, int]) -> None:
+        pattern = self.plan.pattern
+        eliminate(
+            *rows, *self._couplings, *self._points, self._gradient_of_points,
+            pattern.offsets, pattern.columns, self._blocks, self._side, self._diagonal,
+        )  # fmt: skip
+
     def _multiplied(self, x: FloatArray) -> FloatArray:
         """(S + λD) x without S; each chunk of points has its own sum, and these are added in order."""
-        wide, chunks = x.reshape(-1, BLOCK), self._layout.point_chunks
-        sums = np.zeros((len(chunks), *wide.shape))
-
-        def points(job: tuple[int, tuple[int, int]]) -> None:
-            k, chunk = job
-            multiply(*chunk, *self._couplings, *self._points, wide, sums[k])
-
-        list(ordered_map(points, list(enumerate(chunks)), threads=self._threads))
-        product = sums.sum(axis=0) + self._own.product(wide) + self.scaling * wide
+        wide = x.reshape(-1, BLOCK)
+        of_chunks = partial(self._multiplied_chunk, wide)
+        product = self._own.product(wide) + self.scaling * wide
+        for part in ordered_map(of_chunks, self._layout.point_chunks, threads=self._threads):
+            product += part
         return np.where(self._held, 0.0, product).ravel()
+
+    def _multiplied_chunk(self, x: FloatArray, points: tuple[int, int]) -> FloatArray:
+        product = np.zeros_like(x)
+        multiply(*points, *self._couplings, *self._points, x, product)
+        return product
 
     def _marquardt_diagonal(self) -> FloatArray:
         """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""

@@ -34,7 +34,7 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial
-from sfm.core.optim.losses import loss_id
+from sfm.core.optim.losses import Loss, loss_id
 from sfm.core.optim.schur import Couplings, invert_blocks
 
 Job = TypeVar("Job")
@@ -46,17 +46,19 @@ class BundleSystem:
 
     Args:
         held: (S, 6) entries of the poses' tangents that stay zero, for the gauge.
+
+    Attributes:
         lost_cost: what an observation costs that has no projection.
+        costs: (n,) of the last `evaluate`, in the order by points.
     """
 
     def __init__(
-        self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, lost_cost: float,
-        threads: int,
-    ) -> None:  # fmt: skip
+        self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, threads: int
+    ) -> None:
         self.layout, self._threads, self._rigs = layout, threads, problem.rigs
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self.free_points = problem.free_points.copy()
-        self._loss = (loss_id(config.loss), float(config.loss_scale_px), float(lost_cost))
+        self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
         self._state = _State.of(problem)
         self._trial = self._state.copy()
 
@@ -65,7 +67,7 @@ class BundleSystem:
         self.held[: len(held)] |= held
         self._images = ImageSums.allocate(images, widest)
         self._of_observations = np.empty((len(layout.image), 9 + 3 * widest))
-        self._costs = np.empty(len(layout.image))
+        self.costs = np.empty(len(layout.image))
         self._V, self._g, self._M = np.empty((points, 6)), np.empty((points, 3)), np.empty((points, 6))
         self._couplings = Couplings(
             layout.starts, layout.slot, np.empty((len(layout.slot), 6)),
@@ -138,22 +140,17 @@ class BundleSystem:
         rotations, translations, _ = now.images
         centers, limits = now.centers[lay.slot_frame], kernels.squared_limits(self._model_ids, now.params)
 
-        def images(job: tuple[int, int]) -> float:
-            return kernels.linearize_images(
-                *job, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
-                self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
-                rotations, translations, centers, now.params, now.points3D, *self._loss,
-                self._of_observations, sums.h, sums.F, sums.G, sums.f,
-            )  # fmt: skip
-
-        def points(job: tuple[int, int]) -> None:
-            kernels.gather_points(
-                *job, lay.offsets, lay.obs_slot, lay.column_count, lay.column_place, lay.image, lay.obs_shared,
-                links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
-            )  # fmt: skip
-
-        cost = sum(self._run(images, lay.image_chunks))
-        self._run(points, lay.point_chunks)
+        # Lambdas, since the checks of shapes in the test run would go over each annotated closure again.
+        cost = sum(self._run(lambda images: kernels.linearize_images(
+            *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
+            self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
+            rotations, translations, centers, now.params, now.points3D, self._loss, self._scale, self.lost_cost,
+            self._of_observations, sums.h, sums.F, sums.G, sums.f,
+        ), lay.image_chunks))  # fmt: skip
+        self._run(lambda points: kernels.gather_points(
+            *points, lay.offsets, lay.obs_slot, lay.column_count, lay.column_place, lay.image, lay.obs_shared,
+            links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
+        ), lay.point_chunks)  # fmt: skip
         prior, blocks, gradient = self._known.linearize(now.images[2], now.centers, now.params, now.biases)
         cost += prior
         if self._known.is_about_points:
@@ -162,6 +159,11 @@ class BundleSystem:
         self._reduced.take_over(sums, blocks, gradient)
         largest = max(np.abs(self._reduced.gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
         return float(cost), float(largest)
+
+    def evaluate(self, loss: Loss) -> FloatArray:
+        """ρ of the observations (n,) by points, at the current parameters; NaN where there is no projection."""
+        self._evaluate(self._state, loss_id(loss))
+        return self.costs
 
     def information(self) -> Information:
         """What the problem says about its parameters, as last linearised."""
@@ -180,22 +182,15 @@ class BundleSystem:
         centers, totals = now.centers[lay.slot_frame], np.zeros((len(lay.point_chunks), 5))
         rotations, translations, _ = then.images
 
-        def move(job: tuple[int, int]) -> None:
-            kernels.move_points(
-                *job, *self._couplings, centers, now.points3D, self._M, self._g, delta, then.points3D
-            )  # fmt: skip
-
-        def settle(job: tuple[int, tuple[int, int]]) -> None:
-            k, points = job
-            kernels.settle_points(
-                *points, lay.offsets, lay.source, lay.image, lay.observed, lay.precision, self._image_cameras,
-                self._model_ids, rotations, translations, then.params, now.points3D, *self._loss,
-                damping, self._V, self._g, self._costs, then.points3D, totals[k],
-            )  # fmt: skip
-
-        self._run(move, lay.point_chunks)
-        self._evaluate(then)
-        self._run(settle, list(enumerate(lay.point_chunks)))
+        self._run(lambda points: kernels.move_points(
+            *points, *self._couplings, centers, now.points3D, self._M, self._g, delta, then.points3D
+        ), lay.point_chunks)  # fmt: skip
+        self._evaluate(then, self._loss)
+        self._run(lambda job: kernels.settle_points(
+            *job[1], lay.offsets, lay.source, lay.image, lay.observed, lay.precision, self._image_cameras,
+            self._model_ids, rotations, translations, then.params, now.points3D, self._loss, self._scale,
+            self.lost_cost, damping, self._V, self._g, self.costs, then.points3D, totals[job[0]],
+        ), list(enumerate(lay.point_chunks)))  # fmt: skip
         cost, decrease, step, norm, lost = totals.sum(axis=0)
         cost += self._known.cost(then.images[2], then.params, then.biases, then.points3D)
         then.lost = int(lost)
@@ -210,19 +205,14 @@ class BundleSystem:
     def _run(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
         return list(ordered_map(function, jobs, threads=self._threads if len(jobs) > 1 else 1))
 
-    def _evaluate(self, state: _State) -> None:
-        """Fills the costs of all observations, NaN where there is no projection."""
+    def _evaluate(self, state: _State, loss: int) -> None:
         lay, limits = self.layout, kernels.squared_limits(self._model_ids, state.params)
         rotations, translations, _ = state.images
-
-        def images(job: tuple[int, int]) -> None:
-            kernels.costs_of_images(
-                *job, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision,
-                self._image_cameras, self._model_ids, limits, rotations, translations, state.params,
-                state.points3D, *self._loss[:2], self._costs,
-            )  # fmt: skip
-
-        self._run(images, lay.image_chunks)
+        self._run(lambda images: kernels.costs_of_images(
+            *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision,
+            self._image_cameras, self._model_ids, limits, rotations, translations, state.params,
+            state.points3D, loss, self._scale, self.costs,
+        ), lay.image_chunks)  # fmt: skip
 
     def _eliminate(self, damping: float) -> None:
         """Inverts the blocks of points and takes them out of the reduced system."""

@@ -61,7 +61,8 @@ def nearest_cells(dots, half_squared, cells):
 @njit(cache=True, nogil=True)
 def group(labels, starts, order):
     """Sorts the positions of `labels` (n,) by label, stably: label k has `order[starts[k]:starts[k + 1]]`."""
-    starts[:] = 0
+    for k in range(len(starts)):
+        starts[k] = 0
     for label in labels:
         starts[label + 1] += 1
     for k in range(1, len(starts)):

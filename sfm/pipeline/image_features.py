@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from sfm.core.arrays import BoolArray
 from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, ImageError, Rejected
 from sfm.core.scene import Features
@@ -103,6 +104,8 @@ def follow_features(images: Sequence[SceneImage], config: PipelineConfig) -> Ite
                 continue
             reduced = reduced_image(grey, config.features.max_image_size)
             size = reduced.shape[1], reduced.shape[0]
+            if mask is not None and image.mask:
+                decisions.append(_sought_outside(image, mask, image.mask))
             full_from_reduced[:] = grey.shape[1] / size[0], grey.shape[0] / size[1]
             if mask is not None and mask.shape != reduced.shape:
                 mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(np.bool_)
@@ -114,6 +117,13 @@ def follow_features(images: Sequence[SceneImage], config: PipelineConfig) -> Ite
             verdict = "kept" if len(features) else "no_features"
             decisions.append(Decision(STAGE, image.name, "keypoints", float(len(features)), 1.0, verdict))
         yield FoundFeatures(features, tuple(decisions))
+
+
+def _sought_outside(image: SceneImage, mask: BoolArray, file: MaskFile) -> Decision:
+    """The share of the pixels that a mask hides: corners are not found first and masked then."""
+    hidden = masked_share(mask)
+    told = f"corners sought outside of the mask, {hidden:.0%} of the pixels ({file.path.name})"
+    return Decision(STAGE, image.name, "masked_percent", 100 * hidden, None, "kept", told)
 
 
 def _prepared(

@@ -44,7 +44,7 @@ def test_the_gradient_of_the_prior_agrees_with_differences(rng):
         params[0, 0] = focal
         moved = dataclasses.replace(problem, camera_params=params)
         layout = lay_out(moved, np.ones(len(moved.obs_images), bool))
-        made = BundleSystem(moved, layout, held_by_two_cameras(moved, layout), BundleConfig(), 1e4, 1)
+        made = BundleSystem(moved, layout, held_by_two_cameras(moved, layout), BundleConfig(), 1)
         cost, _ = made.linearize()
         return cost, float(made.gradient[-1, 0])
 

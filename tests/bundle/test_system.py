@@ -86,7 +86,7 @@ class Slow:
 def system_of(problem, loss, gauge=False):
     layout = lay_out(problem, np.isfinite(squared_errors(problem)))
     held = held_by_two_cameras(problem, layout) if gauge else np.zeros((len(layout.slot_frame), 6), bool)
-    return BundleSystem(problem, layout, held, BundleConfig(loss=loss), 1e4, 1), held
+    return BundleSystem(problem, layout, held, BundleConfig(loss=loss), 1), held
 
 
 def parts(system):

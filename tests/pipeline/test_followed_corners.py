@@ -125,3 +125,20 @@ def test_settings_of_other_detectors_change_nothing(frames, tmp_path):
         assert extract_all(opened(database, frames, other)) == keys
         smaller = PipelineConfig(features=FeatureConfig(kind="klt", max_image_size=200))
         assert not set(extract_all(opened(database, frames, smaller)).values()) & set(keys.values())
+
+
+def test_the_ledger_tells_what_a_mask_hides_from_the_search_for_corners(frames, tmp_path):
+    hidden = np.zeros((200, 300), np.uint8)
+    hidden[:, 90:] = 255
+    write_photo(frames / "masks" / "f3.png", hidden)
+    with Database.open(tmp_path / "d.db") as database:
+        run = opened(database, frames)
+        extract_all(run)
+        rows = {f"f{k}.png": database.ledger(f"f{k}.png") for k in range(12)}
+        x = database.read_keypoints(id_of(run, "f3.png"))[:, 0]
+    masked = {name: [row for row in told if row.gate == "masked_percent"] for name, told in rows.items()}
+    assert [name for name in masked if masked[name]] == ["f3.png"]
+    (row,) = masked["f3.png"]
+    assert row.value == pytest.approx(30.0)
+    assert "30% of the pixels (f3.png)" in row.detail
+    assert x.min() >= 90

@@ -46,7 +46,9 @@ def project_point_jacobians(model_id, params, x, y, z, by_point, by_params):
     fx, fy, cx, cy, extra = _scale_and_offset(model_id, params)
     a, b, ax, ay, az, bx, by, bz, ok = _ideal_point(model_id, params, x, y, z)
     u_a, u_b, v_a, v_b = fx, 0.0, 0.0, fy
-    by_params[:] = 0.0
+    for i in range(2):
+        for j in range(MAX_PARAMS):
+            by_params[i, j] = 0.0
     if ok and _is_distorted(model_id):
         coefficients = _coefficients(model_id, params)
         _fill_by_coefficients(model_id, coefficients, fx, fy, a, b, extra, by_params)
@@ -54,8 +56,11 @@ def project_point_jacobians(model_id, params, x, y, z, by_point, by_params):
         u_a, u_b, v_a, v_b = fx * aa, fx * ab, fy * ba, fy * bb
     u, v = fx * a + cx, fy * b + cy
     if not (ok and math.isfinite(u) and math.isfinite(v)):
-        by_point[:] = 0.0
-        by_params[:] = 0.0
+        for i in range(2):
+            for j in range(3):
+                by_point[i, j] = 0.0
+            for j in range(MAX_PARAMS):
+                by_params[i, j] = 0.0
         return math.nan, math.nan, False
     by_point[0, 0] = u_a * ax + u_b * bx
     by_point[0, 1] = u_a * ay + u_b * by

@@ -29,9 +29,9 @@ U, V, OK = 3, 4, 5
 """Pixels, and 1 where there is one."""
 BY_POINT = 6
 """Six rows: the derivatives of u by x, y, z, then those of v."""
-_A, _B, _S, _G, _D = 12, 13, 14, 15, 16
-"""Ideal point, its squared radius, the radial factor and its denominator's inverse."""
-BY_PARAMS = 17
+_A, _B, _S, _G, _D, _A_DISTORTED, _B_DISTORTED = 12, 13, 14, 15, 16, 17, 18
+"""Ideal point, its squared radius, the radial factor and its denominator's inverse; the point on the sensor over f."""
+BY_PARAMS = 19
 """Two rows for each parameter of the model, u before v; see `fill_by_param`."""
 ROWS = BY_PARAMS + 2 * MAX_PARAMS
 
@@ -88,8 +88,9 @@ def _project_perspective(fx, fy, cx, cy, k1, k2, k3, d1, d2, d3, p1, p2, squared
         cross = twice * a * b + 2.0 * (p1 * a + p2 * b)
         aa = g + twice * a * a + 2.0 * p1 * b + 6.0 * p2 * a
         bb = g + twice * b * b + 2.0 * p2 * a + 6.0 * p1 * b
-        u = fx * (a * g + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)) + cx
-        v = fy * (b * g + 2.0 * p2 * a * b + p1 * (s + 2.0 * b * b)) + cy
+        a_distorted = a * g + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a)
+        b_distorted = b * g + 2.0 * p2 * a * b + p1 * (s + 2.0 * b * b)
+        u, v = fx * a_distorted + cx, fy * b_distorted + cy
         ok = inside & (aa * bb - cross * cross > 0.0) & (abs(u) + abs(v) < np.inf)
         w[U * LANES + n], w[V * LANES + n] = (u if ok else 0.0), (v if ok else 0.0)
         w[OK * LANES + n] = 1.0 if ok else 0.0
@@ -100,6 +101,7 @@ def _project_perspective(fx, fy, cx, cy, k1, k2, k3, d1, d2, d3, p1, p2, squared
         w[(BY_POINT + 5) * LANES + n] = -(vx * a + vy * b)
         w[_A * LANES + n], w[_B * LANES + n], w[_S * LANES + n] = a, b, s
         w[_G * LANES + n], w[_D * LANES + n] = g, denominator
+        w[_A_DISTORTED * LANES + n], w[_B_DISTORTED * LANES + n] = a_distorted, b_distorted
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -107,8 +109,8 @@ def fill_by_param(model_id, params, column, w):
     """Fills the two rows BY_PARAMS + 2 column of one parameter; call after `project_lanes`."""
     if not is_perspective(model_id):
         return
-    fx, fy, cx, cy, _ = _scale_and_offset(model_id, params)
-    _fill_perspective(_kind(model_id, column), fx, fy, cx, cy, BY_PARAMS + 2 * column, w)
+    fx, fy, _, _, _ = _scale_and_offset(model_id, params)
+    _fill_perspective(_kind(model_id, column), fx, fy, BY_PARAMS + 2 * column, w)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -120,13 +122,13 @@ def _kind(model_id, column):
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _fill_perspective(kind, fx, fy, cx, cy, row, w):
+def _fill_perspective(kind, fx, fy, row, w):
     by_u, by_v = w[row * LANES : (row + 1) * LANES], w[(row + 1) * LANES : (row + 2) * LANES]
     if kind in (_F, _FX, _FY):
-        along_x, along_y = (0.0 if kind == _FY else 1.0 / fx), (0.0 if kind == _FX else 1.0 / fy)
+        along_x, along_y = (0.0 if kind == _FY else 1.0), (0.0 if kind == _FX else 1.0)
         for n in range(LANES):
-            by_u[n] = (w[U * LANES + n] - cx) * along_x
-            by_v[n] = (w[V * LANES + n] - cy) * along_y
+            by_u[n] = w[_A_DISTORTED * LANES + n] * along_x
+            by_v[n] = w[_B_DISTORTED * LANES + n] * along_y
     elif kind in (_CX, _CY):
         along_x, along_y = (1.0 if kind == _CX else 0.0), (1.0 if kind == _CY else 0.0)
         for n in range(LANES):

@@ -23,7 +23,8 @@ def damped_step(hessian, gradient, damping):
             elif total > 0.0:
                 factor[i, i] = np.sqrt(total)
             else:
-                step[:] = np.nan
+                for k in range(n):
+                    step[k] = np.nan
                 return step
     for i in range(n):
         total = -gradient[i]

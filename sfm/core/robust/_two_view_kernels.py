@@ -190,18 +190,17 @@ def equations(problem, state, loss, square_scale, max_square, hessian, gradient)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract"})
-def _add_products(d, weighted, errors, count, square, product):
-    """Adds W d dᵀ (lower triangle) and W d e of `count` data; sums in any order are three times as fast."""
+def _add_products(d, weighted, count, square):
+    """Adds W d (dᵀ, e) of `count` data, without the part right of the diagonal but for the last column, that of e.
+
+    The rows of `d` (10, count) are those of d and e. Sums in any order are three times as fast.
+    """
     for j in range(9):
-        for k in range(j + 1):
-            total = 0.0
+        for m in range(j + 2):
+            k, total = m if m <= j else 9, 0.0
             for i in range(count):
                 total += weighted[j, i] * d[k, i]
             square[j, k] += total
-        total = 0.0
-        for i in range(count):
-            total += weighted[j, i] * errors[i]
-        product[j] += total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -213,11 +212,17 @@ def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hess
     The sums are taken over M, of nine numbers for either matrix, and brought to the parameters at the end.
     """
     data, calibrated = problem.data, problem.kind == ESSENTIAL
-    square, product = np.zeros((9, 9)), np.zeros(9)
-    # Derivatives of a block of data, one datum a column, and the same times their weights.
-    d, weighted, errors, filled = np.empty((9, _BLOCK)), np.empty((9, _BLOCK)), np.empty(_BLOCK), 0
+    square = np.zeros((9, 10))
+    # Derivatives and errors of a block of data, one datum a column, and the derivatives times their weights. The type
+    # of the counter has no literals, for which a function would be compiled once more.
+    d, weighted, filled = np.empty((10, _BLOCK)), np.empty((9, _BLOCK)), np.int64(0)
     cost = 0.0
-    for i in range(data.shape[1]):
+    for i in range(data.shape[1] + 1):
+        if filled == _BLOCK or i == data.shape[1]:
+            _add_products(d, weighted, filled, square)
+            filled = np.int64(0)
+            if i == data.shape[1]:
+                break
         if calibrated:
             x1, y1, z1, x2, y2, z2 = data[0, i], data[1, i], data[2, i], data[3, i], data[4, i], data[5, i]
         else:
@@ -260,18 +265,14 @@ def epipolar_equations(problem, m, tangent, loss, square_scale, max_square, hess
             d[3 * k + 2, filled] = left * p2 - right * z1
         for k in range(9):
             weighted[k, filled] = weight * d[k, filled]
-        errors[filled] = e
+        d[9, filled] = e
         filled += 1
-        if filled == _BLOCK:
-            _add_products(d, weighted, errors, filled, square, product)
-            filled = 0
-    _add_products(d, weighted, errors, filled, square, product)
     for j in range(9):
         for k in range(j):
             square[k, j] = square[j, k]
     for p in range(tangent.shape[0]):
         for k in range(9):
-            gradient[p] += tangent[p, k] * product[k]
+            gradient[p] += tangent[p, k] * square[k, 9]
             row = 0.0
             for j in range(9):
                 row += tangent[p, j] * square[j, k]

@@ -253,21 +253,28 @@ def farthest_bound(solver: Solver, config: RansacConfig) -> float:
     return max(min(solver.reach, _FARTHEST_PX / config.max_error_px), 1.0)
 
 
+_FEWEST = 20
+_SHARES_OF_DATA = np.geomspace(0.005, 1.0, 30)
+
+
 def _progressive_limit(inliers: Mask, sample_size: int, config: RansacConfig) -> tuple[int, int]:
     """The fewest samples needed among the best n data over all n, and that n; `inliers` are in the order of quality.
 
-    Those n count whose inliers are more than a share of one in ten, with five standard deviations to spare, as chance
-    would bring them in.
+    Thirty n are looked at. Those count whose inliers are more than a share of one in ten, with five standard deviations
+    to spare, as chance would bring them in.
     """
-    limits = [(required_iterations(int(inliers.sum()), len(inliers), sample_size, config), len(inliers))]
-    found = np.cumsum(inliers)
-    sizes = np.unique(np.geomspace(20, len(inliers), 30).astype(int)).tolist() if len(inliers) > 20 else []
-    limits += [
-        (required_iterations(int(found[n - 1]), n, sample_size, config), n)
-        for n in sizes
-        if found[n - 1] > 0.1 * n + 1.5 * math.sqrt(n)
-    ]
-    return min(limits)
+    found, sizes = np.cumsum(inliers), _SHARES_OF_DATA * len(inliers)
+    sizes = np.append(np.unique(sizes[sizes >= _FEWEST].astype(np.int64)), len(inliers))
+    among = found[sizes - 1]
+    convincing = among > 0.1 * sizes + 1.5 * np.sqrt(sizes)
+    convincing[-1] = True
+    sizes, among = sizes[convincing], among[convincing]
+    clean = np.ones(len(sizes))
+    for i in range(sample_size):
+        clean *= np.maximum(among - i, 0) / (sizes - i)
+    # The likelier a clean sample is, the fewer are needed; among equals, the best data are the fewest.
+    k = int(np.argmax(clean))
+    return required_iterations(int(among[k]), int(sizes[k]), sample_size, config), int(sizes[k])
 
 
 def judged(inliers: Mask, needed: int, config: RansacConfig) -> Rejected | None:

@@ -18,7 +18,14 @@ from sfm.core.robust._sampling_kernels import draw_progressively, draw_samples
 from sfm.core.robust._two_view_kernels import ESSENTIAL, FUNDAMENTAL, HOMOGRAPHY, moved, plausible, start
 from sfm.core.robust._two_view_kernels import equations as two_view_equations
 from sfm.core.robust.absolute_pose import ReprojectionProblem, resection
-from sfm.core.robust.ransac import RansacConfig, Solver, farthest_bound, ransac, required_iterations
+from sfm.core.robust.ransac import (
+    RansacConfig,
+    Solver,
+    _progressive_limit,
+    farthest_bound,
+    ransac,
+    required_iterations,
+)
 from sfm.core.robust.refinement import refine
 from sfm.core.robust.relative_pose import flat
 from sfm.core.robust.sampling import Sampler
@@ -386,6 +393,20 @@ def test_samples_are_distinct_in_range_and_cover_everything(size, count):
     assert all(len(set(row)) == size for row in samples.tolist())
     frequency = np.bincount(samples.ravel(), minlength=count) / samples.size * count
     assert abs(frequency - 1).max() < 6 / np.sqrt(samples.size / count)
+
+
+@pytest.mark.parametrize("count", [7, 19, 20, 60, 1000])
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.7, 1.0])
+def test_progressive_samples_end_at_the_fewest_that_any_part_of_the_best_data_needs(count, share):
+    config = RansacConfig(min_iterations=1, max_iterations=10**9)
+    inliers = np.random.default_rng(count).uniform(size=count) < share * np.linspace(1.5, 0.5, count)
+    limit, reach = _progressive_limit(inliers, 5, config)
+    assert limit == required_iterations(int(inliers[:reach].sum()), reach, 5, config)
+    needed = {n: required_iterations(int(inliers[:n].sum()), n, 5, config) for n in (count // 10, count // 2, count)}
+    convincing = [n for n in needed if n >= 20 and inliers[:n].sum() > 0.1 * n + 1.5 * math.sqrt(n)]
+    assert limit <= needed[count]
+    # The parts that are looked at lie a fifth apart: between them a little less may be needed.
+    assert limit <= min([1.5 * needed[n] + 1 for n in convincing], default=needed[count])
 
 
 def test_progressive_samples_grow_from_the_best_data_to_all_and_contain_the_newest():

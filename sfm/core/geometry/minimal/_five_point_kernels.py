@@ -71,8 +71,14 @@ def _add_cube(p, a, b):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _constraints(e, rows):
     """The ten cubics (10, 20) of E, whose nine entries are the linear forms e (3, 3, 4)."""
-    rows[:] = 0.0
-    symmetric = np.zeros((3, 3, 10))
+    symmetric = np.empty((3, 3, 10))
+    for i in range(10):
+        for k in range(20):
+            rows[i, k] = 0.0
+    for i in range(3):
+        for j in range(3):
+            for m in range(10):
+                symmetric[i, j, m] = 0.0
     for i in range(3):
         for j in range(i + 1):
             for k in range(3):
@@ -90,7 +96,8 @@ def _constraints(e, rows):
     minor = np.empty(10)
     for j in range(3):
         a, b = (j + 1) % 3, (j + 2) % 3
-        minor[:] = 0.0
+        for m in range(10):
+            minor[m] = 0.0
         _add_square(minor, e[1, a], e[2, b], 1.0)
         _add_square(minor, e[1, b], e[2, a], -1.0)
         _add_cube(rows[9], minor, e[0, j])

@@ -39,7 +39,10 @@ def _adjugate(m, out):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _conics(cosines, squares, conics):
     """Fills `conics` (2, 3, 3) with C1 and C2, divided by the largest square."""
-    conics[:] = 0.0
+    for n in range(2):
+        for i in range(3):
+            for j in range(3):
+                conics[n, i, j] = 0.0
     unit = max(squares[0], squares[1], squares[2])
     for n in range(2):
         other = 2 - n
@@ -58,7 +61,7 @@ def _line_pair(conics, d, lines, adjugate, cubic, roots):
 
     `d` and what comes after `lines` is scratch, here and below: taking memory for it costs as much as the solution.
     """
-    cubic[:] = 0.0
+    cubic[1] = cubic[2] = 0.0
     for n in range(2):
         cubic[3 * n] = _adjugate(conics[n], adjugate)
         for i in range(3):
