@@ -166,6 +166,23 @@ def test_positions_on_a_line_fix_all_but_the_roll(model, new_from_world, rng):
     np.testing.assert_allclose(found @ line, new_from_world @ line, atol=1e-9)
 
 
+def test_positions_without_heights_fix_an_upright_model(model, new_from_world, rng):
+    """All but its height, of which nothing is known."""
+    places = moved(model, new_from_world)
+    places[1:, 2] = np.nan
+    measured = Measurements(positions=positions(model, places), directions=directions(model, new_from_world))
+    found = frame_from_model(model, priors_of(model, measured, SURE), rng=rng)
+    np.testing.assert_allclose((found @ model.points3D)[:, :2], (new_from_world @ model.points3D)[:, :2], atol=1e-9)
+    assert found.scale == pytest.approx(new_from_world.scale)
+
+
+def test_the_positions_that_have_heights_are_enough(model, new_from_world, rng):
+    places = moved(model, new_from_world)
+    places[3:, 2] = np.nan
+    priors = priors_of(model, Measurements(positions=positions(model, places)), SURE)
+    np.testing.assert_allclose(frame_from_model(model, priors, rng=rng).matrix, new_from_world.matrix, atol=1e-9)
+
+
 def test_one_position_moves_the_model(model, rng):
     priors = priors_of(model, Measurements(positions=positions(model, np.ones((1, 3)))), SURE)
     found = frame_from_model(model, priors, rng=rng)
