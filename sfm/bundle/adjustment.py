@@ -67,8 +67,7 @@ def adjust(
 
 def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tuple[BundleSystem, BoolArray]:
     """The normal equations of `problem`, and which observations (n,) take part."""
-    poses = problem.cams_from_world
-    active = np.isfinite(np.c_[poses.rotation.wxyz, poses.translation]).all(axis=1)[problem.obs_images]
+    active = _has_pose(problem)
     system = _laid_out(problem, active, config, threads)
     valid = np.isfinite(system.evaluate("trivial"))
     if not valid.all():
@@ -78,6 +77,12 @@ def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tup
     worst = max(_LOST_PX**2, float(system.costs.max(initial=0.0)))
     system.lost_cost = 0.5 * float(evaluate_loss(config.loss, np.array(worst), config.loss_scale_px)[0])
     return system, active
+
+
+def _has_pose(problem: BundleProblem) -> BoolArray:
+    """(n,) whether the pose of the observation's image is finite."""
+    poses = problem.cams_from_world
+    return np.isfinite(np.c_[poses.rotation.wxyz, poses.translation]).all(axis=1)[problem.obs_images]
 
 
 def _laid_out(problem: BundleProblem, active: BoolArray, config: BundleConfig, threads: int) -> BundleSystem:
@@ -90,10 +95,9 @@ def _laid_out(problem: BundleProblem, active: BoolArray, config: BundleConfig, t
 
 def squared_errors(problem: BundleProblem) -> FloatArray:
     """|projected − observed|² of every observation (n,) in px²; NaN where there is no projection."""
-    every = np.ones(len(problem.obs_images), bool)
     nothing = {"free_params": np.zeros_like(problem.free_params), "free_poses": np.zeros_like(problem.free_poses)}
     problem = dataclasses.replace(problem, obs_sigmas=None, priors=(), **nothing)
-    layout, out = lay_out(problem, every), np.empty(len(every))
+    layout, out = lay_out(problem, _has_pose(problem)), np.full(len(problem.obs_images), np.nan)
     out[layout.original] = BundleSystem(problem, layout, np.zeros((0, 6), bool), BundleConfig(), 1).evaluate("trivial")
     return out
 

@@ -180,7 +180,7 @@ def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> t
     poses = problem.cams_from_world
     blocks, centers = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 3, 3))
     blocks[problem.free_poses], centers[problem.free_poses] = np.nan, np.nan
-    R, offsets = poses.rotation.matrix, poses.center - frame_centers(problem)[layout.image_frame]
+    R, frames = poses.rotation.matrix, frame_centers(problem)
     seen = np.bincount(layout.image, minlength=len(poses)) > 0
     mounts = _sensor_rows(layout)
     for image in np.flatnonzero(seen):
@@ -188,7 +188,7 @@ def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> t
         if layout.image_slot[image] >= 0:
             turn = np.zeros((6, 6))
             turn[:3, :3] = turn[3:, 3:] = R[image]
-            turn[3:, :3] = -R[image] @ skew(offsets[image])
+            turn[3:, :3] = -R[image] @ skew(poses[image].center - frames[layout.image_frame[image]])
             rows.append(layout.image_slot[image])
             columns.append(turn)
         for row in layout.image_shared[image]:
