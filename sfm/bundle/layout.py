@@ -132,7 +132,7 @@ class Layout:
         work = np.bincount(self.slot, np.arange(len(self.slot)) - self.starts[point] + 2.0, self.rows)
         point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.shared_starts))
         before = np.arange(len(self.shared_slot)) - self.shared_starts[point] + np.diff(self.starts)[point]
-        work += np.bincount(self.shared_slot, before + 1.0, self.rows)
+        work = work + np.bincount(self.shared_slot, before + 1.0, self.rows)  # integers where nothing is counted
         running = np.cumsum(work)
         cuts = np.searchsorted(running, np.arange(1, parts) * (running[-1] / parts) if len(running) else [])
         edges = [0, *(int(cut) + 1 for cut in cuts), self.rows]

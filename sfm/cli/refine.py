@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -15,15 +15,23 @@ from sfm.core.errors import ConfigError, ExitCode, InputError
 
 if TYPE_CHECKING:
     from sfm.bundle.reconstruction import Intrinsics
-    from sfm.pipeline.refinement import RefinedModel
+    from sfm.pipeline.priors import Measurements, PriorConfig
+    from sfm.pipeline.refinement import MeasuredFrame, RefinedModel
 
 EXAMPLES = (
     "sfm refine scene -o scene/refined --refine focal,pp,distortion",
     "sfm refine sparse/0 -o refined --loss cauchy --loss-scale 2 --sigmas",
     "sfm refine sparse/0 -o moved --refine none --hold points",
+    "sfm refine scene -o georeferenced --gps photos",
+    "sfm refine scene -o measured --positions places.csv --position-sigma 0.02 --gravity down.csv",
 )
 
+_FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="")
+_PX = tyro.conf.arg(metavar="PX", help_behavior_hint="")
+_UNITS = tyro.conf.arg(metavar="UNITS", help_behavior_hint="")
+_GPS_SIGMA_M = 5.0
 _KINDS: dict[str, Intrinsics] = {"focal": "focal", "pp": "principal_point", "distortion": "extra"}
+_SENSORS = "sensors"
 _HELD = ("poses", "points")
 
 
@@ -33,6 +41,9 @@ class RefineOptions:
 
     Any COLMAP model will do, binary or text. Poses and points may change unless they are held; nothing is added to the
     model and nothing removed from it, and the source stays as it is.
+
+    What was measured in the scene (positions, gravity, distances, control points) makes up the frame and the scale of
+    the model, and is weighed against its residuals by standard deviations. Tables have commas and a header.
     """
 
     model: Model
@@ -42,7 +53,17 @@ class RefineOptions:
     """Folder for the adjusted model."""
 
     refine: Annotated[str, tyro.conf.arg(metavar="LIST")] = "focal,distortion"
-    """Camera parameters that may change: focal, pp (the principal point), distortion, with commas; or none."""
+    """What of the cameras may change: focal, pp (the principal point), distortion, sensors (their poses on a rig), with
+    commas; or none."""
+
+    focal_sigma: Annotated[float | None, _PX] = None
+    """Standard deviation with which the present focal lengths are known; without it they are not."""
+
+    pp_sigma: Annotated[float | None, _PX] = None
+    """The same of the principal points."""
+
+    distortion_sigma: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
+    """The same of each parameter of the distortion."""
 
     hold: Annotated[str, tyro.conf.arg(metavar="LIST", help_behavior_hint="")] = ""
     """What else may not change: poses, points."""
@@ -61,6 +82,48 @@ class RefineOptions:
 
     tolerance: Annotated[float, tyro.conf.arg(metavar="PART")] = 1e-8
     """Stop where a full step lowers the cost by less than this part."""
+
+    solver: Annotated[Literal["auto", "dense", "sparse", "iterative"], tyro.conf.arg(metavar="NAME")] = "auto"
+    """How the reduced system is solved: dense, sparse (factors), iterative (conjugate gradients); auto: the fastest."""
+
+    positions: Annotated[Path | None, _FILE] = None
+    """Where photos were taken: name,x,y,z or name,latitude,longitude,altitude; also sx,sy,sz."""
+
+    gps: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Where photos were taken by their EXIF: the folder of the photos."""
+
+    position_sigma: Annotated[float | None, _UNITS] = None
+    """Standard deviation of each coordinate of these; 5 m with --gps."""
+
+    position_bias: Annotated[float | None, _UNITS] = None
+    """Standard deviation of a shift that all of them have in common; without it there is none."""
+
+    gravity: Annotated[Path | None, _FILE] = None
+    """Which way is down in the camera (x right, y down, z forward): name,x,y,z; also sigma_deg."""
+
+    gravity_sigma_deg: Annotated[float, tyro.conf.arg(metavar="DEG")] = 1.0
+    """Standard deviation of these."""
+
+    distances: Annotated[Path | None, _FILE] = None
+    """How far apart photos were taken: name1,name2,distance; also sigma."""
+
+    distance_sigma: Annotated[float | None, _UNITS] = None
+    """Standard deviation of these."""
+
+    control_points: Annotated[Path | None, _FILE] = None
+    """Where points lie: point,x,y,z with the ids of points of the model, or those of --marks; also sx,sy,sz."""
+
+    marks: Annotated[Path | None, _FILE] = None
+    """Where control points are marked in photos: point,name,x,y in px, the centre of the first pixel at 0.5."""
+
+    control_sigma: Annotated[float | None, _UNITS] = None
+    """Standard deviation of each coordinate of these."""
+
+    measurement_loss: Annotated[str, tyro.conf.arg(metavar="NAME")] = "huber"
+    """What a measurement costs that deviates by more than three standard deviations."""
+
+    pixel_sigma: Annotated[float, tyro.conf.arg(metavar="PX")] = 1.0
+    """Standard deviation of keypoints, by which residuals are weighed against measurements."""
 
     sigmas: Flag = False
     """Also standard deviations of the camera parameters."""
@@ -81,7 +144,7 @@ class RefineOptions:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(RefineOptions, "refine", words, EXAMPLES)
-    kinds, held = _listed(options.refine, _KINDS, "--refine"), _listed(options.hold, _HELD, "--hold")
+    kinds, held = _listed(options.refine, (*_KINDS, _SENSORS), "--refine"), _listed(options.hold, _HELD, "--hold")
     if options.threads < 0:
         raise ConfigError(f"--threads must not be negative, got {options.threads}")
 
@@ -89,6 +152,7 @@ def main(words: Sequence[str]) -> int:
     from sfm.cli.compare import model_folder
     from sfm.core.execution import available_threads
     from sfm.core.optim.losses import LOSSES
+    from sfm.io.atomic import write_text
     from sfm.io.colmap_model import model_format, read_model, write_model
     from sfm.pipeline.refinement import RefinementConfig, refine_model
 
@@ -106,26 +170,75 @@ def main(words: Sequence[str]) -> int:
             graduated=options.graduated,
             max_iterations=options.max_iterations,
             relative_cost_tolerance=options.tolerance,
+            solver=options.solver,
+        )
+        config = RefinementConfig(
+            intrinsics=tuple(_KINDS[kind] for kind in kinds if kind != _SENSORS),
+            focal_sigma=options.focal_sigma,
+            principal_point_sigma=options.pp_sigma,
+            distortion_sigma=options.distortion_sigma,
+            sensors=_SENSORS in kinds,
+            poses="poses" not in held,
+            points="points" not in held,
+            bundle=bundle,
+            priors=_prior_config(options),
+            pixel_sigma=options.pixel_sigma,
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
-    config = RefinementConfig(
-        intrinsics=tuple(_KINDS[kind] for kind in kinds),
-        poses="poses" not in held,
-        points="points" not in held,
-        bundle=bundle,
-    )
-    threads = options.threads or available_threads()
+    threads, model = options.threads or available_threads(), read_model(source)
+    measured = _measurements(options, model.image_names)
     try:
-        refined = refine_model(read_model(source), config, with_covariance=options.sigmas, threads=threads)
+        refined = refine_model(model, config, measured=measured, with_covariance=options.sigmas, threads=threads)
     except InputError as error:
         raise InputError(error.cause, path=source, remedy=error.remedy) from error
     write_model(refined.reconstruction, options.output, text=options.text)
+    if refined.frame is not None:
+        write_text(options.output / "frame.json", json.dumps(refined.frame.to_json(), indent=2) + "\n")
     print(json.dumps(refined.to_json(), indent=2) if options.json else summary(refined, options.output))
     return ExitCode.OK
 
 
-def _listed(words: str, known: Sequence[str] | dict[str, Intrinsics], option: str) -> list[str]:
+def _prior_config(options: RefineOptions) -> PriorConfig:
+    from sfm.core.optim.losses import LOSSES
+    from sfm.pipeline.priors import PriorConfig
+
+    loss = options.measurement_loss
+    if loss not in LOSSES:
+        raise ConfigError(f"unknown loss {loss!r}", remedy=f"choose one of {', '.join(LOSSES)}")
+    sigma = _GPS_SIGMA_M if options.gps and options.position_sigma is None else options.position_sigma
+    return PriorConfig(
+        position_sigma=sigma,
+        position_bias=options.position_bias,
+        gravity_sigma_deg=options.gravity_sigma_deg,
+        distance_sigma=options.distance_sigma,
+        control_sigma=options.control_sigma,
+        loss=loss,
+    )
+
+
+def _measurements(options: RefineOptions, names: Sequence[str]) -> Measurements | None:
+    """What the options name; None where they name nothing."""
+    from sfm.io import measurements as tables
+    from sfm.pipeline.priors import Measurements, positions_of_photos
+
+    if options.positions and options.gps:
+        raise ConfigError("--positions and --gps exclude each other", remedy="choose one of them")
+    if options.marks and not options.control_points:
+        raise ConfigError("--marks are of control points", remedy="say with --control-points where these lie")
+    if not (options.positions or options.gps or options.gravity or options.distances or options.control_points):
+        return None
+    positions = tables.read_positions(options.positions) if options.positions else None
+    return Measurements(
+        positions=positions_of_photos(options.gps, names) if options.gps else positions,
+        directions=tables.read_directions(options.gravity) if options.gravity else None,
+        distances=tables.read_distances(options.distances) if options.distances else None,
+        control_points=tables.read_control_points(options.control_points) if options.control_points else None,
+        marks=tables.read_marks(options.marks) if options.marks else None,
+    )
+
+
+def _listed(words: str, known: Sequence[str], option: str) -> list[str]:
     names = [word.strip() for word in words.split(",") if word.strip() and word.strip() != "none"]
     for name in names:
         if name not in known:
@@ -146,12 +259,17 @@ def summary(refined: RefinedModel, folder: Path) -> str:
     """A few lines for a person."""
     result, model = refined.result, refined.reconstruction
     count = max(len(result.problem.obs_images) - result.invalid, 1)
+    how = " (by the loss)"
     before, after = ((2 * cost / count) ** 0.5 for cost in (result.initial_cost, result.final_cost))
+    if refined.frame is not None:
+        # The cost is also that of the measurements.
+        how, (before, after) = "", refined.frame.rms_px
     lines = [
         f"{len(model.image_ids)} images · {len(model.points3D)} points · {count} observations",
-        f"root mean square reprojection error {before:.4f} → {after:.4f} px (by the loss), "
+        f"root mean square reprojection error {before:.4f} → {after:.4f} px{how}, "
         f"cost {result.initial_cost:.6g} → {result.final_cost:.6g}",
         f"{result.iterations} iterations; {_REASONS[result.reason]}",
+        *_measured_lines(refined.frame),
     ]
     if result.invalid:
         lines.append(f"{result.invalid} observations have no projection (behind the camera) and took no part")
@@ -169,3 +287,20 @@ def summary(refined: RefinedModel, folder: Path) -> str:
     if len(model.cameras) > 5:
         lines.append(f"and {len(model.cameras) - 5} more cameras (--json has them all)")
     return "\n".join([*lines, f"model    {folder}"])
+
+
+def _measured_lines(frame: MeasuredFrame | None) -> list[str]:
+    if frame is None:
+        return []
+    lines = []
+    for kind, after in frame.deviations[1].items():
+        before, bias = frame.deviations[0][kind], after.get("bias")
+        line = f"{kind:<15}{after['count']}, {before['rms_sigmas']:.3g} → {after['rms_sigmas']:.3g} standard deviations"
+        line += f", {after['unlikely']} hardly by chance" if after["unlikely"] else ""
+        lines.append(line + (f", all shifted by {' '.join(f'{b:.3g}' for b in bias)}" if bias else ""))
+    if frame.not_in_model:
+        lines.append(f"{frame.not_in_model} of the measurements are of images or points that the model lacks")
+    if frame.origin is not None:
+        latitude, longitude, height = frame.origin
+        lines.append(f"frame    east, north, up in m from {latitude:.7f}, {longitude:.7f}, {height:.2f} m (frame.json)")
+    return lines

@@ -3,7 +3,8 @@
 An adjustment moves by small steps; a model in a frame of its own is first brought near to what was measured. Three
 positions that are not on a line, or control points, fix all of it. Positions on a line leave open how it is turned
 about the line, one position everything but the place; then directions of gravity and distances decide, and what no
-measurement decides stays as it is.
+measurement decides stays as it is. Positions without heights fix all of it in a level scene; in another, gravity has
+to say what is level.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ def frame_from_model(model: Reconstruction, priors: ModelPriors, *, rng: np.rand
         if isinstance(prior, GravityPrior):
             there = _uprighting(prior, model) @ there
     mine, theirs, sigma = _correspondences(model, priors)
-    return there if not len(mine) else _placing(there @ mine, theirs, sigma, rng) @ there
+    upright = any(isinstance(prior, GravityPrior) for prior in priors.of_poses)
+    return there if not len(mine) else _placing_measured(there @ mine, theirs, sigma, upright, rng) @ there
 
 
 def _scaling(prior: DistancePrior, centers: Points3D) -> Sim3:
@@ -65,10 +67,7 @@ def _uprighting(prior: GravityPrior, model: Reconstruction) -> Sim3:
 
 
 def _correspondences(model: Reconstruction, priors: ModelPriors) -> tuple[Points3D, Points3D, float]:
-    """Places of the model and where they were measured, in the unit of the latter, and how far these may be off.
-
-    A coordinate that was not measured counts as the mean of the others, or 0.
-    """
+    """Places of the model and where they were measured, NaN where not, and how far these may be off."""
     mine, theirs, sigmas = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)]
     for prior in (*priors.of_poses, *priors.of_points):
         if isinstance(prior, PositionPrior | PointPrior):
@@ -76,11 +75,25 @@ def _correspondences(model: Reconstruction, priors: ModelPriors) -> tuple[Points
             mine.append((model.cams_from_world.center if isinstance(prior, PositionPrior) else model.points3D)[rows])
             variances = np.einsum("kaa->ka", prior.covariances)
             measured = np.isfinite(variances)
-            sums = np.where(measured, prior.positions, 0.0).sum(axis=0)
-            theirs.append(np.where(measured, prior.positions, sums / np.maximum(measured.sum(axis=0), 1)))
+            theirs.append(np.where(measured, prior.positions, np.nan))
             sigmas.append(np.sqrt(np.where(measured, variances, 0.0).max(axis=1)))
     typical = np.concatenate(sigmas)
     return np.concatenate(mine), np.concatenate(theirs), float(np.median(typical)) if len(typical) else 0.0
+
+
+def _placing_measured(mine: Points3D, theirs: Points3D, sigma: float, upright: bool, rng: np.random.Generator) -> Sim3:
+    """The similarity from places of which some coordinates may be NaN; of an upright model in its level if so."""
+    complete = np.isfinite(theirs).all(axis=1)
+    if np.all(complete) or complete.sum() >= 3:
+        return _placing(mine[complete], theirs[complete], sigma, rng)
+    means = np.where(np.isnan(theirs), 0.0, theirs).sum(axis=0) / np.maximum(np.isfinite(theirs).sum(axis=0), 1)
+    theirs = np.where(np.isnan(theirs), means, theirs)
+    if not upright:
+        return _placing(mine, theirs, sigma, rng)
+    level = np.array([1.0, 1.0, 0.0])
+    turned = _placing(mine * level, theirs * level, sigma, rng)
+    rise = theirs[:, 2].mean() - (turned @ mine)[:, 2].mean()
+    return Sim3(np.ones(()), Rotation3.identity(), np.array([0.0, 0.0, rise])) @ turned
 
 
 def _placing(mine: Points3D, theirs: Points3D, sigma: float, rng: np.random.Generator) -> Sim3:
@@ -99,7 +112,7 @@ def _placing(mine: Points3D, theirs: Points3D, sigma: float, rng: np.random.Gene
         agreeing = 0 if isinstance(found, Rejected) else int(found[1].sum())
         raise InputError(
             f"positions contradict the model: only {agreeing} of {len(mine)} are within {within:.3g} of where it says",
-            remedy="check names, units and the order of the columns",
+            remedy="check names, units and the order of the columns; without heights, tell --gravity",
         )
     return found[0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,8 +10,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm.bundle import BundleConfig, BundleCovariance
+from sfm.bundle import BundleCovariance
 from sfm.core.errors import InputError, Rejected
+from sfm.core.geometry.rotation import Rotation3
+from sfm.core.geometry.similarity import Sim3
+from sfm.core.scene.transformation import transformed
 from sfm.io.colmap_model import read_model
 from sfm.pipeline.refinement import RefinementConfig, refine_model
 from tests.cli.test_cli import assert_one_line
@@ -84,8 +88,20 @@ def test_the_noise_is_found_and_the_focal_length_is_as_certain_as_it_claims(dist
     assert np.sqrt(2 * refined.result.final_cost / count) == pytest.approx(NOISE_PX, rel=0.15)
 
 
+def test_parameters_that_are_known_stay_near(disturbed):
+    model = read_model(disturbed)
+    known = RefinementConfig(intrinsics=("focal", "principal_point"), focal_sigma=1e-3, principal_point_sigma=1e-3)
+    camera = refine_model(model, known).reconstruction.cameras[1]
+    np.testing.assert_allclose(camera.params[:3], model.cameras[1].params[:3], atol=0.1)
+    vaguely = dataclasses.replace(known, focal_sigma=1e3)
+    assert refine_model(model, vaguely).reconstruction.cameras[1].params[0] < model.cameras[1].params[0] - 5
+    with pytest.raises(ValueError, match="focal_sigma must be positive"):
+        RefinementConfig(focal_sigma=0.0)
+
+
 def test_a_summary_says_whether_it_has_converged(sfm, disturbed, tmp_path):
-    result = sfm("refine", disturbed, "-o", "one", "--max-iterations", "1", "--loss", "soft_l1", "--text")
+    words = ("--max-iterations", "1", "--loss", "soft_l1", "--solver", "dense", "--text")
+    result = sfm("refine", disturbed, "-o", "one", *words)
     assert result.returncode == 0, result.stderr
     assert "NOT CONVERGED" in result.stdout
     assert (tmp_path / "one" / "cameras.txt").exists()
@@ -120,11 +136,140 @@ def test_models_that_cannot_be_adjusted_are_told(sfm, disturbed, tmp_path):
     assert_one_line(sfm("refine", "behind", "-o", "out"), 3, "no observation of this model has a projection")
 
 
-def test_rigs_are_refused_before_they_come_apart(tmp_path):
+@pytest.fixture
+def on_rigs(tmp_path):
+    """Four moments of two cameras on a rig, with noise."""
     pycolmap.set_random_seed(1)
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 2, 4, 50
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 1, 2, 4, 80
+    reconstruction = pycolmap.synthesize_dataset(options)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev, noise.point3D_stddev = NOISE_PX, 0.02
+    noise.rig_from_world_translation_stddev, noise.rig_from_world_rotation_stddev = 0.02, 0.3
+    pycolmap.synthesize_noise(noise, reconstruction)
     (tmp_path / "rig").mkdir()
-    pycolmap.synthesize_dataset(options).write(tmp_path / "rig")
-    with pytest.raises(InputError, match="rig"):
-        refine_model(read_model(tmp_path / "rig"), RefinementConfig(bundle=BundleConfig(max_iterations=1)))
+    reconstruction.write(tmp_path / "rig")
+    return tmp_path / "rig"
+
+
+def mounts(model):
+    """The pose of the second image of each frame in the camera of the first."""
+    rows = [np.searchsorted(model.image_ids, list(frame.image_ids.values())) for frame in model.frames]
+    return np.array([(model.cams_from_world[int(b)] @ model.cams_from_world[int(a)].inverse()).matrix for a, b in rows])
+
+
+@pytest.mark.parametrize("sensors", [False, True])
+def test_rigs_stay_together(on_rigs, sensors):
+    model = read_model(on_rigs)
+    refined = refine_model(model, RefinementConfig(intrinsics=(), sensors=sensors))
+    after = refined.reconstruction
+    assert refined.result.final_cost < 0.5 * refined.result.initial_cost
+    np.testing.assert_allclose(mounts(after), mounts(after)[:1].repeat(4, axis=0), atol=1e-9)
+    assert np.allclose(mounts(after), mounts(model), atol=1e-9) != sensors
+
+
+def test_rigs_whose_mounts_are_not_known_are_refused(on_rigs):
+    model = read_model(on_rigs)
+    rig = dataclasses.replace(model.rigs[0], sensors_from_rig=dict.fromkeys(model.rigs[0].sensors_from_rig))
+    with pytest.raises(InputError, match="is not known"):
+        refine_model(dataclasses.replace(model, rigs=(rig,)))
+
+
+MOVED = Sim3(np.array(2.5), Rotation3.exp(np.array([0.3, -1.0, 0.5])), np.array([100.0, -50.0, 20.0]))
+"""By which the frame of the measurements differs from that of the model."""
+
+
+@pytest.fixture(scope="module")
+def surveyed(disturbed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Tables of what was measured of the disturbed model: exact, in the frame of the truth."""
+    model = refine_model(read_model(disturbed), RefinementConfig(intrinsics=())).reconstruction
+    truth = transformed(model, MOVED)
+    folder = tmp_path_factory.mktemp("surveyed")
+    names, centers = truth.image_names, truth.cams_from_world.center
+    rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip(names, centers.tolist(), strict=True)]
+    (folder / "positions.csv").write_text("\n".join(["name,x,y,z", *rows]) + "\n")
+    down = -truth.cams_from_world.rotation.matrix[:, :, 2]
+    rows = [f"{name},{x!r},{y!r},{z!r}" for name, (x, y, z) in zip(names, down.tolist(), strict=True)]
+    (folder / "gravity.csv").write_text("\n".join(["name,x,y,z", *rows]) + "\n")
+    length = float(np.linalg.norm(centers[0] - centers[4]))
+    (folder / "distances.csv").write_text(f"name1,name2,distance,sigma\n{names[0]},{names[4]},{length!r},0.001\n")
+    rows = [
+        f"{k},{x!r},{y!r},{z!r}" for k, (x, y, z) in zip(truth.point_ids[:9], truth.points3D[:9].tolist(), strict=True)
+    ]
+    (folder / "points.csv").write_text("\n".join(["point,x,y,z", *rows]) + "\n")
+    return folder
+
+
+def centers_of(folder: Path) -> np.ndarray:
+    return read_model(folder).cams_from_world.center
+
+
+def positions_in(table: Path) -> np.ndarray:
+    return np.array([[float(cell) for cell in row.split(",")[1:]] for row in table.read_text().splitlines()[1:]])
+
+
+def test_measured_positions_make_up_frame_and_scale(sfm, disturbed, surveyed, tmp_path):
+    table = surveyed / "positions.csv"
+    result = sfm("refine", disturbed, "-o", "out", "--refine", "none", "--positions", table, "--position-sigma", "0.01")
+    assert result.returncode == 0, result.stderr
+    assert "positions      8, " in result.stdout
+    np.testing.assert_allclose(centers_of(tmp_path / "out"), positions_in(table), atol=0.03)
+    told = json.loads((tmp_path / "out" / "frame.json").read_text())
+    assert told["origin"] is None
+    assert told["frame_from_model"]["scale"] == pytest.approx(2.5, rel=0.05)
+    assert told["measurements"]["after"]["positions"]["rms_sigmas"] < 1.5
+
+
+def test_a_common_shift_of_all_positions_is_found(sfm, disturbed, surveyed, tmp_path):
+    shifted = positions_in(surveyed / "positions.csv") + [0.5, 0.0, -0.3]
+    names = [row.split(",")[0] for row in (surveyed / "positions.csv").read_text().splitlines()[1:]]
+    rows = [f"{name},{x},{y},{z}" for name, (x, y, z) in zip(names, shifted.tolist(), strict=True)]
+    (tmp_path / "shifted.csv").write_text("\n".join(["name,x,y,z", *rows]))
+    control = ("--control-points", surveyed / "points.csv", "--control-sigma", "0.01")
+    words = ("--positions", "shifted.csv", "--position-sigma", "0.01", "--position-bias", "1", *control, "--json")
+    result = sfm("refine", disturbed, "-o", "out", "--refine", "none", *words)
+    assert result.returncode == 0, result.stderr
+    after = json.loads(result.stdout)["frame"]["measurements"]["after"]
+    np.testing.assert_allclose(after["positions"]["bias"], [-0.5, 0.0, 0.3], atol=0.03)
+    np.testing.assert_allclose(centers_of(tmp_path / "out"), positions_in(surveyed / "positions.csv"), atol=0.05)
+
+
+def test_gravity_and_a_distance_make_the_model_upright_and_metric(sfm, disturbed, surveyed, tmp_path):
+    words = ("--gravity", surveyed / "gravity.csv", "--distances", surveyed / "distances.csv")
+    result = sfm("refine", disturbed, "-o", "out", "--refine", "none", *words)
+    assert result.returncode == 0, result.stderr
+    ours, theirs = centers_of(tmp_path / "out"), positions_in(surveyed / "positions.csv")
+    assert np.linalg.norm(ours[0] - ours[4]) == pytest.approx(np.linalg.norm(theirs[0] - theirs[4]), abs=0.003)
+    np.testing.assert_allclose(ours[:, 2] - ours[0, 2], theirs[:, 2] - theirs[0, 2], atol=0.1)
+
+
+def test_control_points_that_are_marked_in_photos_make_up_the_frame(sfm, disturbed, tmp_path):
+    model, lines = read_model(disturbed), ["point,name,x,y"]
+    chosen = np.flatnonzero(model.tracks.lengths >= 4)[:6]
+    for k, row in enumerate(chosen):
+        for o in range(model.tracks.offsets[row], model.tracks.offsets[row + 1]):
+            x, y = model.observations[o]
+            lines.append(f"P{k},{model.image_names[model.image_rows[o]]},{x},{y}")
+    (tmp_path / "marks.csv").write_text("\n".join(lines))
+    truth = transformed(refine_model(model, RefinementConfig(intrinsics=())).reconstruction, MOVED)
+    rows = [f"P{k},{x},{y},{z}" for k, (x, y, z) in enumerate(truth.points3D[chosen].tolist())]
+    (tmp_path / "points.csv").write_text("\n".join(["point,x,y,z", *rows, "P99,0,0,0"]))
+    words = ("--control-points", "points.csv", "--control-sigma", "0.02", "--marks", "marks.csv")
+    result = sfm("refine", disturbed, "-o", "out", "--refine", "none", *words)
+    assert result.returncode == 0, result.stderr
+    assert "control points 6, " in result.stdout
+    assert "1 of the measurements are of images or points that the model lacks" in result.stdout
+    out = read_model(tmp_path / "out")
+    assert len(out.points3D) == len(model.points3D)
+    np.testing.assert_allclose(out.cams_from_world.center, truth.cams_from_world.center, atol=0.1)
+
+
+def test_measurements_that_will_not_do_are_told(sfm, disturbed, surveyed, tmp_path):
+    table = surveyed / "positions.csv"
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", table), 3, "--position-sigma")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", table, "--gps", "."), 2, "exclude each other")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--gps", tmp_path), 3, "says where it was taken")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--pixel-sigma", "0"), 2, "pixel_sigma must be positive")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--marks", table), 2, "of control points")
+    (tmp_path / "bad.csv").write_text("name,x,y\na,1,2\n")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", "bad.csv"), 3, "lacks z")

@@ -2,6 +2,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from sfm.bundle.priors import DistancePrior, GravityPrior, PointPrior, PositionPrior
 from sfm.core.cameras import Camera
@@ -165,6 +166,23 @@ def test_positions_on_a_line_fix_all_but_the_roll(model, new_from_world, rng):
     np.testing.assert_allclose(found @ line, new_from_world @ line, atol=1e-9)
 
 
+def test_positions_without_heights_fix_an_upright_model(model, new_from_world, rng):
+    """All but its height, of which nothing is known."""
+    places = moved(model, new_from_world)
+    places[1:, 2] = np.nan
+    measured = Measurements(positions=positions(model, places), directions=directions(model, new_from_world))
+    found = frame_from_model(model, priors_of(model, measured, SURE), rng=rng)
+    np.testing.assert_allclose((found @ model.points3D)[:, :2], (new_from_world @ model.points3D)[:, :2], atol=1e-9)
+    assert found.scale == pytest.approx(new_from_world.scale)
+
+
+def test_the_positions_that_have_heights_are_enough(model, new_from_world, rng):
+    places = moved(model, new_from_world)
+    places[3:, 2] = np.nan
+    priors = priors_of(model, Measurements(positions=positions(model, places)), SURE)
+    np.testing.assert_allclose(frame_from_model(model, priors, rng=rng).matrix, new_from_world.matrix, atol=1e-9)
+
+
 def test_one_position_moves_the_model(model, rng):
     priors = priors_of(model, Measurements(positions=positions(model, np.ones((1, 3)))), SURE)
     found = frame_from_model(model, priors, rng=rng)
@@ -211,6 +229,20 @@ def test_deviations_are_counted_in_standard_deviations(model):
     assert told["positions"]["rms_sigmas"] == pytest.approx(10 / np.sqrt(3 * IMAGES))
     assert told["positions"]["bias"] == [0.5, 0.5, 0.5]
     assert told["control points"]["rms_sigmas"] == 0.0
+
+
+def test_photos_say_where_they_were_taken(tmp_path):
+    places = {"a.jpg": (48.5, 16.25, 170.0), "b.jpg": (-33.5, 151.0, None), "c.jpg": None}
+    for name, place in places.items():
+        exif = Image.Exif()
+        if place is not None:
+            angles = {1: "S" if place[0] < 0 else "N", 2: (abs(place[0]), 0.0, 0.0), 3: "E", 4: (place[1], 0.0, 0.0)}
+            exif.get_ifd(ExifTags.IFD.GPSInfo).update(angles if place[2] is None else angles | {5: b"\0", 6: place[2]})
+        Image.new("RGB", (8, 8)).save(tmp_path / name, exif=exif)
+    found = positions_of_photos(tmp_path, [*places, "missing.jpg"])
+    assert found.names == ("a.jpg", "b.jpg")
+    assert found.geodetic
+    np.testing.assert_allclose(found.places, [[48.5, 16.25, 170.0], [-33.5, 151.0, np.nan]])
 
 
 def test_photos_without_a_place_are_told(tmp_path):
