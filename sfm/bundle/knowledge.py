@@ -27,10 +27,6 @@ from sfm.core.arrays import FloatArray
 from sfm.core.geometry.rotation import skew
 from sfm.core.optim.block_pattern import BLOCK
 
-_NO_TERMS = PriorTerms(
-    np.zeros((0, 3)), np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3, 6)), np.zeros((0, 3, 6))
-)  # fmt: skip
-
 
 class Knowledge:
     """The priors of one problem.
@@ -46,9 +42,7 @@ class Knowledge:
         self._seen = (np.diff(layout.offsets) > 0) & problem.free_points
         self._expected = _ExpectedParams.of(problem, layout)
         self._biases = bias_count(self._poses)
-        poses = problem.cams_from_world
-        turns, centers, biases = poses.rotation.matrix, poses.center, np.zeros((self._biases, 3))
-        _, terms = self._terms(turns, centers, frame_centers(problem), biases)
+        terms = self._terms_at(problem)
         first, second = self._rows_of(terms.first), self._rows_of(terms.second)
         self._first, self._second = np.flatnonzero(first >= 0), np.flatnonzero(second >= 0)
         self._both = np.flatnonzero((first >= 0) & (second >= 0))
@@ -112,13 +106,18 @@ class Knowledge:
     def _terms(
         self, turns: FloatArray, centers: FloatArray, frame_centers: FloatArray, biases: FloatArray
     ) -> tuple[float, PriorTerms]:
-        if not self._poses:
-            return 0.0, _NO_TERMS
         cost, terms = linearize_priors(self._poses, turns, centers, biases)
         if self._rigs is not None:
             frames = self._layout.image_frame
             terms = on_frames(terms, frames, centers - frame_centers[frames], len(self._layout.frame_slot))
         return cost, terms
+
+    def _terms_at(self, problem: BundleProblem) -> PriorTerms:
+        if not self._poses:
+            none = np.zeros(0, np.int32)
+            return PriorTerms(np.zeros((0, 3)), none, none, np.zeros((0, 3, 6)), np.zeros((0, 3, 6)))
+        poses, biases = problem.cams_from_world, np.zeros((self._biases, 3))
+        return self._terms(poses.rotation.matrix, poses.center, frame_centers(problem), biases)[1]
 
     def _rows_of(self, numbers: np.ndarray) -> np.ndarray:
         """Rows of the unknowns of terms, −1 for none and for what does not move."""
@@ -138,8 +137,7 @@ def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray) -
         tangents: (F, 6, 7) by which the frames move; a point X moves by  a × X + b + c X.
     """
     known = Knowledge(problem, layout)
-    poses, biases = problem.cams_from_world, np.zeros((known._biases, 3))
-    _, terms = known._terms(poses.rotation.matrix, poses.center, frame_centers(problem), biases)
+    terms = known._terms_at(problem)
     frames = len(tangents)
     rows = np.zeros((len(terms.first), 3, 7))
     for number, jacobian in ((terms.first, terms.jacobian_first), (terms.second, terms.jacobian_second)):

@@ -22,7 +22,7 @@ from sfm.bundle import _layout_kernels as kernels
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import SolverChoice
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.execution import machine_bytes, ordered_map
+from sfm.core.execution import Workers, machine_bytes
 from sfm.core.optim._block_kernels import WIDTH
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
@@ -34,6 +34,8 @@ _FLOOR = 1e-8
 """Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
 _FULL_ROWS = 200
 """Up to here the pattern is full without a look at what points couple."""
+_COUPLINGS_PER_THREAD = 8192
+"""With fewer, a share of the elimination takes little longer than handing it out."""
 _PRODUCT_SECONDS_PER_COUPLING, _PRODUCTS_PER_STEP = 1.5e-8, 150
 """Measured on one core, and a guess at how many products a step takes."""
 _MODEL_TOLERANCE, _RESIDUAL_TOLERANCE, _MAX_GRADIENTS = 0.01, 1e-9, 500
@@ -96,14 +98,15 @@ class ReducedSystem:
     """
 
     def __init__(
-        self, layout: Layout, held: BoolArray, couplings: Couplings, terms: RowTerms, plan: SolverPlan, threads: int
+        self, layout: Layout, held: BoolArray, couplings: Couplings, terms: RowTerms, plan: SolverPlan, workers: Workers
     ) -> None:
-        self.plan, self._layout, self._held, self._couplings, self._threads = plan, layout, held, couplings, threads
+        self.plan, self._layout, self._held, self._couplings, self._workers = plan, layout, held, couplings, workers
         self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
         self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
-        self._ranges = layout.row_ranges(max(threads, 1))
+        parts = (len(couplings.slot) + len(couplings.shared_slot)) // _COUPLINGS_PER_THREAD
+        self._ranges = layout.row_ranges(min(max(parts, 1), workers.threads))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
         self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
         self._gradient_of_points = np.zeros((0, 3))
@@ -128,12 +131,12 @@ class ReducedSystem:
         self._diagonal[:] = self._own.diagonal
 
         self._gradient_of_points = g
-        list(ordered_map(self._eliminate_rows, self._ranges, threads=self._threads))
+        self._workers.map(self._eliminate_rows, self._ranges)
 
     def solve(self, damping: float) -> FloatArray | None:
         """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
         self.scaling = damping * self._marquardt_diagonal()
-        if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._threads):
+        if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._workers.threads):
             return None
         side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
         if self.plan.kind == "iterative":
@@ -167,7 +170,7 @@ class ReducedSystem:
         wide = x.reshape(-1, BLOCK)
         of_chunks = partial(self._multiplied_chunk, wide)
         product = self._own.product(wide) + self.scaling * wide
-        for part in ordered_map(of_chunks, self._layout.point_chunks, threads=self._threads):
+        for part in self._workers.map(of_chunks, self._layout.point_chunks):
             product += part
         return np.where(self._held, 0.0, product).ravel()
 

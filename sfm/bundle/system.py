@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,16 +29,13 @@ from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
 from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.execution import ordered_map
+from sfm.core.execution import Workers
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial
 from sfm.core.optim.losses import Loss, loss_id
 from sfm.core.optim.schur import Couplings, invert_blocks
-
-Job = TypeVar("Job")
-Answer = TypeVar("Answer")
 
 
 class BundleSystem:
@@ -56,7 +52,9 @@ class BundleSystem:
     def __init__(
         self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, threads: int
     ) -> None:
-        self.layout, self._threads, self._rigs = layout, threads, problem.rigs
+        self.layout, self._rigs = layout, problem.rigs
+        workers = Workers(threads)
+        self._run = workers.map
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self.free_points = problem.free_points.copy()
         self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
@@ -76,7 +74,7 @@ class BundleSystem:
         )  # fmt: skip
         self._known = Knowledge(problem, layout)
         plan = plan_solver(layout, self.held, self._known.targets, config.solver)
-        self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, threads)
+        self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, workers)
 
     @property
     def free_count(self) -> int:
@@ -201,9 +199,6 @@ class BundleSystem:
         """Makes the last trial current."""
         self._state, self._trial = self._trial, self._state
 
-    def _run(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
-        return list(ordered_map(function, jobs, threads=self._threads if len(jobs) > 1 else 1))
-
     def _evaluate(self, state: _State, loss: int) -> None:
         lay, limits = self.layout, kernels.squared_limits(self._model_ids, state.params)
         rotations, translations, _ = state.images
@@ -301,9 +296,9 @@ class _State:
     def of(problem: BundleProblem) -> _State:
         rigs, poses = problem.rigs, problem.cams_from_world
         moving = poses if rigs is None else rigs.rigs_from_world
-        frames = _Frames(
-            moving.rotation.wxyz.copy(), moving.center, moving.rotation.matrix, moving.translation.copy()
-        )  # fmt: skip
+        turns = moving.rotation.matrix
+        centers = -np.einsum("fji,fj->fi", turns, moving.translation)
+        frames = _Frames(moving.rotation.wxyz.copy(), centers, turns, moving.translation.copy())
         return _State(
             frames,
             (frames.rotations, frames.translations, frames.centers) if rigs is None else _as_arrays(poses),
