@@ -22,7 +22,8 @@ from typing import Literal, Protocol, TypeAlias, runtime_checkable
 StopReason: TypeAlias = Literal["relative_cost", "gradient", "step", "max_iterations", "no_free_parameters"]
 
 _INITIAL_DAMPING = 1e-4
-_MIN_DAMPING, _MAX_DAMPING = 1e-16, 1e20
+_MIN_DAMPING, _MAX_DAMPING = 1e-13, 1e20
+"""Less changes no step, but rounding makes a matrix indefinite in directions that are free, as those of a scene are."""
 _FREE_DAMPING = 1.0
 """Above it a step is less than half of the undamped one, and a small decrease says nothing."""
 _MIN_GAIN = 1e-3
