@@ -223,22 +223,35 @@ def squared_limits(model_ids, params):
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def turn_poses(frames, delta, wxyz, centers, new_wxyz, new_centers):
-    """Moves the poses `frames` by δ = (ω, υ) in world axes: R exp(ω), and the centre to C − υ."""
+def turn_poses(frames, delta, wxyz, centers, R, t, new_wxyz, new_centers, new_R, new_t):
+    """Moves the poses `frames` by δ = (ω, υ) in world axes: R exp(ω), and the centre to C − υ; those of δ = 0 stay."""
     for k in range(len(frames)):
-        i = frames[k]
-        w0, w1, w2 = delta[k, 0], delta[k, 1], delta[k, 2]
-        square = w0 * w0 + w1 * w1 + w2 * w2
+        i, d = frames[k], delta[k]
+        if d[0] == 0.0 and d[1] == 0.0 and d[2] == 0.0 and d[3] == 0.0 and d[4] == 0.0 and d[5] == 0.0:
+            for a in range(4):
+                new_wxyz[i, a] = wxyz[i, a]
+            for a in range(3):
+                new_centers[i, a], new_t[i, a] = centers[i, a], t[i, a]
+                for b in range(3):
+                    new_R[i, a, b] = R[i, a, b]
+            continue
+        square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
         angle = math.sqrt(square)
         half = 0.5 - square / 48.0 if angle < 1e-4 else math.sin(0.5 * angle) / angle
-        q0, q1, q2, q3 = math.cos(0.5 * angle), half * w0, half * w1, half * w2
+        q0, q1, q2, q3 = math.cos(0.5 * angle), half * d[0], half * d[1], half * d[2]
         p0, p1, p2, p3 = wxyz[i, 0], wxyz[i, 1], wxyz[i, 2], wxyz[i, 3]
-        n0 = p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3
-        n1 = p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2
-        n2 = p0 * q2 - p1 * q3 + p2 * q0 + p3 * q1
-        n3 = p0 * q3 + p1 * q2 - p2 * q1 + p3 * q0
-        scale = 1.0 / math.sqrt(n0 * n0 + n1 * n1 + n2 * n2 + n3 * n3)
-        new_wxyz[i, 0], new_wxyz[i, 1] = n0 * scale, n1 * scale
-        new_wxyz[i, 2], new_wxyz[i, 3] = n2 * scale, n3 * scale
+        w = p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3
+        x = p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2
+        y = p0 * q2 - p1 * q3 + p2 * q0 + p3 * q1
+        z = p0 * q3 + p1 * q2 - p2 * q1 + p3 * q0
+        scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w * scale, x * scale, y * scale, z * scale
+        new_wxyz[i, 0], new_wxyz[i, 1], new_wxyz[i, 2], new_wxyz[i, 3] = w, x, y, z
+        r = new_R[i]
+        r[0, 0], r[0, 1], r[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+        r[1, 0], r[1, 1], r[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+        r[2, 0], r[2, 1], r[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+        c0, c1, c2 = centers[i, 0] - d[3], centers[i, 1] - d[4], centers[i, 2] - d[5]
+        new_centers[i, 0], new_centers[i, 1], new_centers[i, 2] = c0, c1, c2
         for a in range(3):
-            new_centers[i, a] = centers[i, a] - delta[k, 3 + a]
+            new_t[i, a] = -(r[a, 0] * c0 + r[a, 1] * c1 + r[a, 2] * c2)

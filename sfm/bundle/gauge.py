@@ -46,8 +46,8 @@ def _anchor_and_second(problem: BundleProblem, layout: Layout) -> tuple[int, int
     frame = layout.image_frame[layout.image]
     seen = np.bincount(frame, minlength=len(layout.frame_slot))
     constant = np.flatnonzero((layout.frame_slot < 0) & (seen > 0))
-    constant_points = np.unique(layout.point[~problem.free_points[layout.point]])
-    if not len(layout.slot_frame) or len(constant) >= 2 or len(constant_points) >= 3:
+    constant_points = int(np.sum(_seen(layout) & ~problem.free_points))
+    if not len(layout.slot_frame) or len(constant) >= 2 or constant_points >= 3:
         return None
     anchor = int(constant[0]) if len(constant) else int(np.argmax(seen))
     return anchor, None if _scale_is_seen(problem, layout) else _second_frame(problem, layout, frame, anchor)
@@ -71,13 +71,14 @@ def put_back(before: BundleProblem, after: BundleProblem, layout: Layout) -> Bun
     Left as it is where something else holds it: constant points, more than one constant pose, priors.
     """
     chosen = _anchor_and_second(before, layout)
-    if before.priors or chosen is None or not before.free_points[layout.point].all():
+    if before.priors or chosen is None or not before.free_points[_seen(layout)].all():
         return after
     anchor, second = chosen
     old, new = _frames(before), _frames(after)
-    turn, scale = old[anchor].rotation.inverse() @ new[anchor].rotation, 1.0
+    were, are = old.center, new.center
+    turn, scale = old.rotation[anchor].inverse() @ new.rotation[anchor], 1.0
     if second is not None:
-        baseline, here = old[second].center - old[anchor].center, turn @ (new[second].center - new[anchor].center)
+        baseline, here = were[second] - were[anchor], turn @ (are[second] - are[anchor])
         axis = int(np.argmax(np.abs(baseline)))
         # The coordinate that is held, unless the second camera has gone far astray.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -86,7 +87,7 @@ def put_back(before: BundleProblem, after: BundleProblem, layout: Layout) -> Bun
                 scale = float(np.linalg.norm(baseline) / np.linalg.norm(here))
     if not 0 < scale < np.inf:
         return after
-    shift = old[anchor].center - scale * (turn @ new[anchor].center)
+    shift = were[anchor] - scale * (turn @ are[anchor])
     return _transformed(after, layout, old, anchor, Sim3(np.array(scale), turn, shift))
 
 
@@ -94,12 +95,12 @@ def _transformed(problem: BundleProblem, layout: Layout, old: Rigid3, anchor: in
     """The observed parts of the problem, moved; the anchor as it was, to the last bit."""
     frames, moving = _frames(problem), layout.slot_frame
     turns, translations = frames.rotation.wxyz.copy(), frames.translation.copy()
-    turned = frames[moving].rotation @ motion.rotation.inverse()
+    turned = frames.rotation[moving] @ motion.rotation.inverse()
     turns[moving] = turned.wxyz
-    translations[moving] = -(turned @ (motion @ frames[moving].center))
+    translations[moving] = -(turned @ (motion @ frames.center[moving]))
     turns[anchor], translations[anchor] = old.rotation.wxyz[anchor], old.translation[anchor]
     frames, points3D = Rigid3(Rotation3(turns), translations), problem.points3D.copy()
-    seen = np.diff(layout.offsets) > 0
+    seen = _seen(layout)
     points3D[seen] = motion @ points3D[seen]
     if problem.rigs is None:
         return dataclasses.replace(problem, cams_from_world=frames, points3D=points3D)
@@ -108,6 +109,11 @@ def _transformed(problem: BundleProblem, layout: Layout, old: Rigid3, anchor: in
     sensors = Rigid3(sensors.rotation, lengths[:, None] * sensors.translation)
     rigs = dataclasses.replace(problem.rigs, rigs_from_world=frames, sensors_from_rig=sensors)
     return dataclasses.replace(problem, cams_from_world=rigs.cams_from_world, points3D=points3D, rigs=rigs)
+
+
+def _seen(layout: Layout) -> BoolArray:
+    """(P,) which points have an observation."""
+    return np.diff(layout.offsets) > 0
 
 
 def _frames(problem: BundleProblem) -> Rigid3:
@@ -131,9 +137,9 @@ def _scale_is_seen(problem: BundleProblem, layout: Layout) -> bool:
 
 def _second_frame(problem: BundleProblem, layout: Layout, frame: np.ndarray, anchor: int) -> int | None:
     """The moving frame farthest from `anchor` among those that share many points with it."""
-    with_anchor = np.zeros(len(problem.points3D), bool)
-    with_anchor[layout.point[frame == anchor]] = True
-    shared = np.bincount(frame[with_anchor[layout.point]], minlength=len(layout.frame_slot))
+    with_anchor, point = np.zeros(len(problem.points3D), bool), layout.point
+    with_anchor[point[frame == anchor]] = True
+    shared = np.bincount(frame[with_anchor[point]], minlength=len(layout.frame_slot))
     shared[anchor] = 0
     shared[layout.frame_slot < 0] = 0
     if not shared.any():

@@ -5,10 +5,12 @@ Camera parameters that are expected to be θ₀ with standard deviation σ add �
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from sfm.bundle.gauge import frame_centers
-from sfm.bundle.layout import SENSOR_COLUMN, Layout
+from sfm.bundle.layout import Layout
 from sfm.bundle.prior_terms import (
     PriorTerms,
     bias_count,
@@ -22,7 +24,6 @@ from sfm.bundle.priors import DistancePrior, GravityPrior, whitening
 from sfm.bundle.problem import BundleProblem
 from sfm.bundle.reduced import RowTerms
 from sfm.core.arrays import FloatArray
-from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import skew
 from sfm.core.optim.block_pattern import BLOCK
 
@@ -39,55 +40,62 @@ class Knowledge:
         self._layout, self._rigs = layout, problem.rigs
         self._poses, self._points = problem.pose_priors, problem.point_priors
         self._seen = (np.diff(layout.offsets) > 0) & problem.free_points
-        self._expected, self._weight = _parameter_priors(problem, layout)
+        self._expected = _ExpectedParams.of(problem, layout)
         self._biases = bias_count(self._poses)
-        _, terms = self._terms(problem.cams_from_world, frame_centers(problem), np.zeros((self._biases, 3)))
+        terms = self._terms_at(problem)
         first, second = self._rows_of(terms.first), self._rows_of(terms.second)
         self._first, self._second = np.flatnonzero(first >= 0), np.flatnonzero(second >= 0)
         self._both = np.flatnonzero((first >= 0) & (second >= 0))
         self._row, self._other = first, second
-        shared = len(layout.slot_frame) + np.arange(len(layout.shared))
+        shared = self._expected.block_rows
         rows, columns = first[self._both], second[self._both]
         self.targets = RowTerms(
             np.concatenate([shared, first[self._first], second[self._second], np.maximum(rows, columns)]),
             np.concatenate([shared, first[self._first], second[self._second], np.minimum(rows, columns)]),
         )
-        self.count = int(np.sum(self._weight > 0)) + 3 * self._biases + _measured(problem)
+        self.count = len(self._expected.weights) + 3 * self._biases + _measured(problem)
 
     def linearize(
-        self, poses: Rigid3, frame_centers: FloatArray, params: FloatArray, biases: FloatArray
+        self, turns: FloatArray, centers: FloatArray, frame_centers: FloatArray, params: FloatArray, biases: FloatArray
     ) -> tuple[float, FloatArray, FloatArray]:
-        """Cost, blocks (m, 6, 6) for `targets`, and gradient (rows, 6) of what is about poses and parameters."""
-        cost, terms = self._terms(poses, frame_centers, biases)
+        """Cost, blocks (m, 6, 6) for `targets`, and gradient (rows, 6) of what is about poses and parameters.
+
+        Args:
+            turns, centers: (I, 3, 3) and (I, 3) of the images; frame_centers (F, 3).
+        """
+        gradient = np.zeros((self._layout.rows, BLOCK))
+        cost = self._expected.linearize(params, gradient)
+        if not self._poses:
+            return cost, self._expected.blocks, gradient
+        of_poses, terms = self._terms(turns, centers, frame_centers, biases)
         J1, J2 = terms.jacobian_first, terms.jacobian_second
-        away = self._unexpected(params)
         crossed = np.einsum("kca,kcb->kab", J1[self._both], J2[self._both])
         upper = self._row[self._both] < self._other[self._both]
         crossed[upper] = crossed[upper].transpose(0, 2, 1)
         blocks = np.concatenate([
-            self._weight[:, :, None] * np.eye(BLOCK),
+            self._expected.blocks,
             np.einsum("kca,kcb->kab", J1[self._first], J1[self._first]),
             np.einsum("kca,kcb->kab", J2[self._second], J2[self._second]),
             crossed,
         ])  # fmt: skip
-        gradient = np.zeros((self._layout.rows, BLOCK))
-        gradient[len(self._layout.slot_frame) :] = self._weight * away
         for J, mine, row in ((J1, self._first, self._row), (J2, self._second, self._other)):
             np.add.at(gradient, row[mine], np.einsum("kca,kc->ka", J[mine], terms.residuals[mine]))
-        return cost + self._parameter_cost(params), blocks, gradient
+        return cost + of_poses, blocks, gradient
 
     def linearize_points(self, points3D: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Cost, information (P, 6) and gradient (P, 3) of what is about points; zero for points that do not move."""
         cost, V, g = linearize_point_priors(self._points, points3D)
         return cost, np.where(self._seen[:, None], V, 0.0), np.where(self._seen[:, None], g, 0.0)
 
-    def cost(self, poses: Rigid3, params: FloatArray, biases: FloatArray, points3D: FloatArray) -> float:
+    def cost(
+        self, turns: FloatArray, centers: FloatArray, params: FloatArray, biases: FloatArray, points3D: FloatArray
+    ) -> float:
         """The cost alone."""
-        total = self._parameter_cost(params)
+        total = self._expected.cost(params)
         if self._points:
             total += point_prior_cost(self._points, points3D)
         if self._poses:
-            total += prior_cost(self._poses, poses.rotation.matrix, poses.center, biases)
+            total += prior_cost(self._poses, turns, centers, biases)
         return total
 
     @property
@@ -95,15 +103,21 @@ class Knowledge:
         """Whether a prior is about points."""
         return bool(self._points)
 
-    def _terms(self, poses: Rigid3, centers: FloatArray, biases: FloatArray) -> tuple[float, PriorTerms]:
-        if not self._poses:
-            none = np.zeros(0, np.int32)
-            return 0.0, PriorTerms(np.zeros((0, 3)), none, none, np.zeros((0, 3, 6)), np.zeros((0, 3, 6)))
-        cost, terms = linearize_priors(self._poses, poses.rotation.matrix, poses.center, biases)
+    def _terms(
+        self, turns: FloatArray, centers: FloatArray, frame_centers: FloatArray, biases: FloatArray
+    ) -> tuple[float, PriorTerms]:
+        cost, terms = linearize_priors(self._poses, turns, centers, biases)
         if self._rigs is not None:
             frames = self._layout.image_frame
-            terms = on_frames(terms, frames, poses.center - centers[frames], len(self._layout.frame_slot))
+            terms = on_frames(terms, frames, centers - frame_centers[frames], len(self._layout.frame_slot))
         return cost, terms
+
+    def _terms_at(self, problem: BundleProblem) -> PriorTerms:
+        if not self._poses:
+            none = np.zeros(0, np.int32)
+            return PriorTerms(np.zeros((0, 3)), none, none, np.zeros((0, 3, 6)), np.zeros((0, 3, 6)))
+        poses, biases = problem.cams_from_world, np.zeros((self._biases, 3))
+        return self._terms(poses.rotation.matrix, poses.center, frame_centers(problem), biases)[1]
 
     def _rows_of(self, numbers: np.ndarray) -> np.ndarray:
         """Rows of the unknowns of terms, −1 for none and for what does not move."""
@@ -115,13 +129,6 @@ class Knowledge:
         rows[numbers >= frames] = biases[numbers[numbers >= frames] - frames]
         return rows
 
-    def _unexpected(self, params: FloatArray) -> FloatArray:
-        """θ − θ₀ (T, 6) of the free camera parameters that have a prior, 0 for the others."""
-        return np.where(self._weight > 0, _values(params, self._layout) - self._expected, 0.0)
-
-    def _parameter_cost(self, params: FloatArray) -> float:
-        return 0.5 * float(np.sum(self._weight * self._unexpected(params) ** 2))
-
 
 def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray) -> FloatArray:
     """(n, 7) what priors see of motions of the whole scene: their residuals' derivatives, rows of length 1.
@@ -130,7 +137,7 @@ def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray) -
         tangents: (F, 6, 7) by which the frames move; a point X moves by  a × X + b + c X.
     """
     known = Knowledge(problem, layout)
-    _, terms = known._terms(problem.cams_from_world, frame_centers(problem), np.zeros((known._biases, 3)))
+    terms = known._terms_at(problem)
     frames = len(tangents)
     rows = np.zeros((len(terms.first), 3, 7))
     for number, jacobian in ((terms.first, terms.jacobian_first), (terms.second, terms.jacobian_second)):
@@ -146,19 +153,50 @@ def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray) -
     return rows[lengths > 0] / lengths[lengths > 0][:, None]
 
 
-def _values(params: FloatArray, layout: Layout) -> FloatArray:
-    """(T, 6) the parameters in the places of the shared rows; anything where there is none."""
-    columns = np.where(layout.shared.columns < SENSOR_COLUMN, np.maximum(layout.shared.columns, 0), 0)
-    return params[np.maximum(layout.shared.camera, 0)[:, None], columns] if len(params) else np.zeros(columns.shape)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _ExpectedParams:
+    """The free camera parameters that are expected to be something, K of them.
 
+    Attributes:
+        cells: camera and column of each; places: its row of six and its place there.
+        expected, weights: (K,) θ₀ and 1 / σ².
+        block_rows, blocks: (m,) rows with such parameters, and what they add on the diagonal of S, (m, 6, 6).
+    """
 
-def _parameter_priors(problem: BundleProblem, layout: Layout) -> tuple[FloatArray, FloatArray]:
-    """Expected values and inverse variances (T, 6) of the free parameters in the shared rows."""
-    if problem.prior_params is None or problem.prior_sigmas is None:
-        return np.zeros(layout.shared.columns.shape), np.zeros(layout.shared.columns.shape)
-    is_param = (layout.shared.columns >= 0) & (layout.shared.camera >= 0)[:, None]
-    weight = _values(problem.prior_sigmas, layout) ** -2.0
-    return _values(problem.prior_params, layout), np.where(is_param, weight, 0.0)
+    cells: tuple[np.ndarray, np.ndarray]
+    places: tuple[np.ndarray, np.ndarray]
+    expected: FloatArray
+    weights: FloatArray
+    block_rows: np.ndarray
+    blocks: FloatArray
+
+    @staticmethod
+    def of(problem: BundleProblem, layout: Layout) -> _ExpectedParams:
+        shared = layout.shared
+        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        camera, column = shared.camera[row], shared.columns[row, place]
+        expected = weights = np.zeros(0)
+        if problem.prior_params is not None and problem.prior_sigmas is not None:
+            expected, weights = problem.prior_params[camera, column], problem.prior_sigmas[camera, column] ** -2.0
+        known = np.flatnonzero(weights > 0)
+        row, place, weights = row[known], place[known], weights[known]
+        rows, number = np.unique(row, return_inverse=True)
+        blocks = np.zeros((len(rows), BLOCK, BLOCK))
+        blocks[number, place, place] = weights
+        poses, cells = len(layout.slot_frame), (camera[known], column[known])
+        return _ExpectedParams(cells, (poses + row, place), expected[known], weights, poses + rows, blocks)
+
+    def linearize(self, params: FloatArray, gradient: FloatArray) -> float:
+        """The cost, and its gradient into that of all rows (rows, 6)."""
+        away = params[self.cells] - self.expected
+        weighted = self.weights * away
+        gradient[self.places] = weighted
+        return 0.5 * float((weighted * away).sum())
+
+    def cost(self, params: FloatArray) -> float:
+        """½ Σ ((θ − θ₀) / σ)²."""
+        away = params[self.cells] - self.expected
+        return 0.5 * float((self.weights * away * away).sum())
 
 
 def _measured(problem: BundleProblem) -> int:

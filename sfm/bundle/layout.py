@@ -128,6 +128,8 @@ class Layout:
 
     def row_ranges(self, parts: int) -> list[tuple[int, int]]:
         """Ranges of rows that take about the same work to eliminate."""
+        if parts == 1:
+            return [(0, self.rows)] if self.rows else []
         point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
         work = np.bincount(self.slot, np.arange(len(self.slot)) - self.starts[point] + 2.0, self.rows)
         point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.shared_starts))

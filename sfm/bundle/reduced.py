@@ -22,7 +22,7 @@ from sfm.bundle import _layout_kernels as kernels
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import SolverChoice
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.execution import machine_bytes, ordered_map
+from sfm.core.execution import Workers, machine_bytes
 from sfm.core.optim._block_kernels import WIDTH
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
@@ -34,6 +34,8 @@ _FLOOR = 1e-8
 """Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
 _FULL_ROWS = 200
 """Up to here the pattern is full without a look at what points couple."""
+_COUPLINGS_PER_THREAD = 8192
+"""With fewer, a share of the elimination takes little longer than handing it out."""
 _PRODUCT_SECONDS_PER_COUPLING, _PRODUCTS_PER_STEP = 1.5e-8, 150
 """Measured on one core, and a guess at how many products a step takes."""
 _MODEL_TOLERANCE, _RESIDUAL_TOLERANCE, _MAX_GRADIENTS = 0.1, 1e-9, 200
@@ -113,15 +115,16 @@ class ReducedSystem:
     """
 
     def __init__(
-        self, layout: Layout, held: BoolArray, couplings: Couplings, terms: RowTerms, plan: SolverPlan, threads: int
+        self, layout: Layout, held: BoolArray, couplings: Couplings, terms: RowTerms, plan: SolverPlan, workers: Workers
     ) -> None:
-        self.plan, self._layout, self._held, self._couplings, self._threads = plan, layout, held, couplings, threads
+        self.plan, self._layout, self._held, self._couplings, self._workers = plan, layout, held, couplings, workers
         self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
         self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
         self._narrow = not np.any(layout.shared.columns[:, 3:] >= 0)
-        self._ranges = layout.row_ranges(max(threads, 1))
+        parts = (len(couplings.slot) + len(couplings.shared_slot)) // _COUPLINGS_PER_THREAD
+        self._ranges = layout.row_ranges(min(max(parts, 1), workers.threads))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))
         self._points = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 6)))
         self._gradient_of_points = np.zeros((0, 3))
@@ -146,12 +149,12 @@ class ReducedSystem:
         self._diagonal[:] = self._own.diagonal
 
         self._gradient_of_points = g
-        list(ordered_map(self._eliminate_rows, self._ranges, threads=self._threads))
+        self._workers.map(self._eliminate_rows, self._ranges)
 
     def solve(self, damping: float) -> FloatArray | None:
         """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
         self.scaling = damping * self._marquardt_diagonal()
-        if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._threads):
+        if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._workers.threads):
             return None
         side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
         if self.plan.kind == "iterative":
@@ -185,7 +188,7 @@ class ReducedSystem:
         wide = x.reshape(-1, BLOCK)
         of_chunks = partial(self._multiplied_chunk, wide)
         product = self._own.product(wide) + self.scaling * wide
-        for part in ordered_map(of_chunks, self._layout.point_chunks, threads=self._threads):
+        for part in self._workers.map(of_chunks, self._layout.point_chunks):
             product += part
         return np.where(self._held, 0.0, product).ravel()
 
@@ -196,12 +199,11 @@ class ReducedSystem:
 
     def _marquardt_diagonal(self) -> FloatArray:
         """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
-        poses = len(self._layout.slot_frame)
-        raised = []
-        for part in (self._diagonal[:poses], self._diagonal[poses:]):
-            largest = part.max(axis=0, initial=0.0)
-            raised.append(np.maximum(part, np.where(largest > 0, _FLOOR * largest, 1.0)))
-        return np.concatenate(raised)
+        raised, poses = np.empty_like(self._diagonal), len(self._layout.slot_frame)
+        for part in (slice(None, poses), slice(poses, None)):
+            largest = self._diagonal[part].max(axis=0, initial=0.0)
+            np.maximum(self._diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
+        return raised
 
 
 @dataclasses.dataclass(slots=True)
@@ -243,62 +245,62 @@ class RowTerms(NamedTuple):
 class _OwnBlocks:
     """What images and priors contribute to S and its gradient, whatever becomes of the points.
 
-    But for the blocks of poses themselves, which the elimination adds.
+    But for the blocks of poses themselves, which the elimination adds. Each number of a linearisation has an entry
+    among those of the blocks; the numbers of one entry are added in the order of images, then of terms.
     """
 
     def __init__(self, layout: Layout, terms: RowTerms, pattern: BlockPattern) -> None:
-        shared, slots = layout.image_shared, layout.image_slot
-        self._images, self._most = shared.shape
-        self._rows_count, self._place = layout.rows, layout.column_place
-        self._shared, self._moving = shared >= 0, slots >= 0
-        self._coupled = self._shared & self._moving[:, None]
-        self._both = self._shared[:, :, None] & self._shared[:, None, :] & np.tri(self._most, dtype=bool)
-        self._used = np.arange(layout.columns.shape[1]) < layout.column_count[:, None]
-        images, k = np.nonzero(self._coupled)
-        i, a, b = np.nonzero(self._both)
-        rows = np.concatenate([shared[images, k], shared[i, a], terms.rows])
-        columns = np.concatenate([slots[images], shared[i, b], terms.columns])
-        self._sums = _Sums(rows.astype(np.int64) * layout.rows + columns)
-        self._rows, self._columns = np.divmod(self._sums.targets, max(layout.rows, 1))
-        self._numbers = pattern.find(self._rows, self._columns)
-        self._gradients = _Sums(np.concatenate([slots[self._moving], shared[self._shared]]))
-        self._blocks = np.zeros((len(self._rows), BLOCK, BLOCK))
+        slots, columns, self._count = layout.image_slot, layout.columns.shape[1], layout.rows
+        self._used = np.arange(columns) < layout.column_count[:, None]
+        self._moving = slots >= 0
+        # The row of each column of an image, and where it stands there.
+        row = np.take_along_axis(layout.image_shared, layout.column_place // BLOCK, axis=1).astype(np.int64)
+        inner, six = layout.column_place % BLOCK, np.arange(BLOCK)
+
+        i, k = np.nonzero(self._used & self._moving[:, None])
+        j, a, b = np.nonzero(self._used[:, :, None] & self._used[:, None, :] & np.tri(columns, dtype=bool))
+        rows = np.concatenate([row[i, k], row[j, a], terms.rows])
+        columns_of = np.concatenate([slots[i], row[j, b], terms.columns])
+        targets, number = np.unique(rows * self._count + columns_of, return_inverse=True)
+        self._rows, self._columns = np.divmod(targets, max(self._count, 1))
+        numbers = pattern.find(self._rows, self._columns)
+        self._formed = np.flatnonzero(numbers >= 0)
+        self._numbers = numbers[self._formed]
+
+        begins = BLOCK * BLOCK * number
+        of_columns, of_terms = begins[len(i) : len(i) + len(j)], begins[len(i) + len(j) :]
+        # On the diagonal of S, of which G has only the lower triangle.
+        above = (row[j, a] == row[j, b]) & (a != b)
+        lower = (j * columns + a) * columns + b
+        self._from_F = (((BLOCK * i)[:, None] + six) * columns + k[:, None]).ravel()
+        self._from_G = np.concatenate([lower, lower[above]])
+        self._entries = np.concatenate([
+            ((begins[: len(i)] + BLOCK * inner[i, k])[:, None] + six).ravel(),
+            of_columns + BLOCK * inner[j, a] + inner[j, b],
+            (of_columns + BLOCK * inner[j, b] + inner[j, a])[above],
+            (of_terms[:, None] + np.arange(BLOCK * BLOCK)).ravel(),
+        ])  # fmt: skip
+        self._gradient_entries = np.concatenate([
+            (BLOCK * slots[self._moving, None] + six).ravel(), (BLOCK * row + inner)[self._used]
+        ])  # fmt: skip
+        self._blocks, self.diagonal = np.zeros((len(targets), BLOCK, BLOCK)), np.zeros((self._count, BLOCK))
+        """(rows, 6) what they have on the diagonal of S."""
 
     def set(self, F: FloatArray, G: FloatArray, blocks: FloatArray) -> None:
         """Takes over the sums of a linearisation, and the blocks (m, 6, 6) of the terms."""
-        size = self._most * BLOCK
-        wide, square = np.zeros((self._images, size, BLOCK)), np.zeros((self._images, size, size))
-        image, k = np.nonzero(self._used)
-        wide[image, self._place[image, k]] = F[image, :, k]
-        lower = self._used[:, :, None] & self._used[:, None, :] & np.tri(self._used.shape[1], dtype=bool)
-        image, a, b = np.nonzero(lower)
-        values = G[image, a, b]
-        a, b = self._place[image, a], self._place[image, b]
-        square[image, a, b] = square[image, b, a] = values
-        square = square.reshape(self._images, self._most, BLOCK, self._most, BLOCK).transpose(0, 1, 3, 2, 4)
-        wide = wide.reshape(self._images, self._most, BLOCK, BLOCK)
-        self._blocks = self._sums.of(np.concatenate([wide[self._coupled], square[self._both], blocks]))
+        values = np.concatenate([F.take(self._from_F), G.take(self._from_G), blocks.ravel()])
+        self._blocks = _summed(self._entries, values, self._blocks.size).reshape(-1, BLOCK, BLOCK)
+        own = np.flatnonzero(self._rows == self._columns)
+        self.diagonal[self._rows[own]] = self._blocks[own].diagonal(axis1=1, axis2=2)
 
     def add(self, blocks: FloatArray) -> None:
         """Adds them to those blocks of the reduced system that are formed."""
-        formed = self._numbers >= 0
-        blocks[self._numbers[formed], :, :BLOCK] += self._blocks[formed]
-
-    @property
-    def diagonal(self) -> FloatArray:
-        """(rows, 6) what they have on the diagonal of S."""
-        out, own = np.zeros((self._rows_count, BLOCK)), self._rows == self._columns
-        out[self._rows[own]] = np.einsum("kaa->ka", self._blocks[own])
-        return out
+        blocks[self._numbers, :, :BLOCK] += self._blocks[self._formed]
 
     def gradient(self, h: FloatArray, f: FloatArray) -> FloatArray:
         """(rows, 6) from those of the images' frames (I, 6) and columns (I, k)."""
-        wide, rows = np.zeros((self._images, self._most * BLOCK)), np.zeros((self._rows_count, BLOCK))
-        image, k = np.nonzero(self._used)
-        wide[image, self._place[image, k]] = f[image, k]
-        shared = wide.reshape(self._images, self._most, BLOCK)[self._shared]
-        rows[self._gradients.targets] = self._gradients.of(np.concatenate([h[self._moving], shared]))
-        return rows
+        values = np.concatenate([h[self._moving].ravel(), f[self._used]])
+        return _summed(self._gradient_entries, values, self._count * BLOCK).reshape(-1, BLOCK)
 
     def product(self, x: FloatArray) -> FloatArray:
         """What they contribute to S x, for x (rows, 6)."""
@@ -309,13 +311,6 @@ class _OwnBlocks:
         return out
 
 
-class _Sums:
-    """Sums of rows that have the same target, in the order of the rows."""
-
-    def __init__(self, targets: np.ndarray) -> None:
-        self._order = np.argsort(targets, kind="stable")
-        self.targets, self._starts = np.unique(targets[self._order], return_index=True)
-
-    def of(self, values: FloatArray) -> FloatArray:
-        """The sums for `targets`."""
-        return np.add.reduceat(values[self._order], self._starts) if len(self._order) else values[:0]
+def _summed(entries: np.ndarray, values: FloatArray, count: int) -> FloatArray:
+    """(count,) sums of the values of each entry, in their order."""
+    return np.bincount(entries, values, count).astype(np.float64, copy=False)  # of nothing it makes integers

@@ -17,8 +17,8 @@ Points are cut into chunks whose number depends on the problem alone and whose s
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, TypeVar
+import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,16 +29,13 @@ from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
 from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.execution import ordered_map
+from sfm.core.execution import Workers
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial
 from sfm.core.optim.losses import Loss, loss_id
 from sfm.core.optim.schur import Couplings, invert_blocks
-
-Job = TypeVar("Job")
-Answer = TypeVar("Answer")
 
 
 class BundleSystem:
@@ -55,12 +52,14 @@ class BundleSystem:
     def __init__(
         self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, threads: int
     ) -> None:
-        self.layout, self._threads, self._rigs = layout, threads, problem.rigs
+        self.layout, self._rigs = layout, problem.rigs
+        workers = Workers(threads)
+        self._run = workers.map
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self.free_points = problem.free_points.copy()
         self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
         self._state = _State.of(problem)
-        self._trial = self._state.copy()
+        self._trial, self._places = self._state.copy(), _Places.of(layout)
 
         images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
         self.held = layout.padding
@@ -75,7 +74,7 @@ class BundleSystem:
         )  # fmt: skip
         self._known = Knowledge(problem, layout)
         plan = plan_solver(layout, self.held, self._known.targets, config.solver)
-        self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, threads)
+        self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, workers)
 
     @property
     def free_count(self) -> int:
@@ -106,15 +105,12 @@ class BundleSystem:
     @property
     def cams_from_world(self) -> Rigid3:
         """Current poses of the images, a batch (I,)."""
-        return self._state.images[2]
+        return self._state.frames.poses if self._rigs is None else self._state.mounted(self._rigs).cams_from_world
 
     @property
     def rigs(self) -> RigArrays | None:
         """Current rigs, where there are any."""
-        now = self._state
-        if self._rigs is None:
-            return None
-        return dataclasses.replace(self._rigs, rigs_from_world=now.frames, sensors_from_rig=now.sensors)
+        return None if self._rigs is None else self._state.mounted(self._rigs)
 
     @property
     def gradient(self) -> FloatArray:
@@ -137,21 +133,23 @@ class BundleSystem:
         sums = self._images
         sums.clear()
         links.B.fill(0)
-        rotations, translations, _ = now.images
-        centers, limits = now.centers[lay.slot_frame], kernels.squared_limits(self._model_ids, now.params)
+        rotations, translations, centers = now.images
+        row_centers, limits = self._row_centers(), kernels.squared_limits(self._model_ids, now.params)
 
         # Lambdas, since the checks of shapes in the test run would go over each annotated closure again.
         cost = sum(self._run(lambda images: kernels.linearize_images(
             *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
             self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
-            rotations, translations, centers, now.params, now.points3D, self._loss, self._scale, self.lost_cost,
+            rotations, translations, row_centers, now.params, now.points3D, self._loss, self._scale, self.lost_cost,
             self._of_observations, sums.h, sums.F, sums.G, sums.f,
         ), lay.image_chunks))  # fmt: skip
         self._run(lambda points: kernels.gather_points(
             *points, lay.offsets, lay.obs_slot, lay.column_count, lay.column_place, lay.image, lay.obs_shared,
             links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
         ), lay.point_chunks)  # fmt: skip
-        prior, blocks, gradient = self._known.linearize(now.images[2], now.centers, now.params, now.biases)
+        prior, blocks, gradient = self._known.linearize(
+            rotations, centers, now.frames.centers, now.params, now.biases
+        )  # fmt: skip
         cost += prior
         if self._known.is_about_points:
             prior, V, g = self._known.linearize_points(now.points3D)
@@ -168,8 +166,7 @@ class BundleSystem:
     def information(self) -> Information:
         """What the problem says about its parameters, as last linearised."""
         self._eliminate(0.0)
-        centers = self._state.centers[self.layout.slot_frame]
-        return Information(self._reduced.matrix(), self._couplings, centers, self._V, self._M)
+        return Information(self._reduced.matrix(), self._couplings, self._row_centers(), self._V, self._M)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
@@ -178,12 +175,12 @@ class BundleSystem:
         if delta is None:
             return None
         lay, now, then = self.layout, self._state, self._trial
-        now.move(delta, lay, then)
-        centers, totals = now.centers[lay.slot_frame], np.zeros((len(lay.point_chunks), 5))
-        rotations, translations, _ = then.images
+        now.move(delta, lay.slot_frame, self._places, self._rigs, then)
+        row_centers, totals = self._row_centers(), np.zeros((len(lay.point_chunks), 5))
+        rotations, translations, centers = then.images
 
         self._run(lambda points: kernels.move_points(
-            *points, *self._couplings, centers, now.points3D, self._M, self._g, delta, then.points3D
+            *points, *self._couplings, row_centers, now.points3D, self._M, self._g, delta, then.points3D
         ), lay.point_chunks)  # fmt: skip
         self._evaluate(then, self._loss)
         self._run(lambda job: kernels.settle_points(
@@ -192,18 +189,15 @@ class BundleSystem:
             self.lost_cost, damping, self._V, self._g, self.costs, then.points3D, totals[job[0]],
         ), list(enumerate(lay.point_chunks)))  # fmt: skip
         cost, decrease, step, norm, lost = totals.sum(axis=0)
-        cost += self._known.cost(then.images[2], then.params, then.biases, then.points3D)
+        cost += self._known.cost(rotations, centers, then.params, then.biases, then.points3D)
         then.lost = int(lost)
-        decrease += 0.5 * float(np.sum(self._reduced.scaling * delta**2 - self._reduced.gradient * delta))
-        norm += np.sum(centers**2) + len(centers) + np.sum(now.params**2)
-        return Trial(float(cost), float(decrease), float(np.sqrt(step + np.sum(delta**2))), float(np.sqrt(norm)))
+        decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
+        norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
+        return Trial(float(cost), float(decrease), math.sqrt(step + _squared(delta)), math.sqrt(norm))
 
     def accept(self) -> None:
         """Makes the last trial current."""
         self._state, self._trial = self._trial, self._state
-
-    def _run(self, function: Callable[[Job], Answer], jobs: Sequence[Job]) -> list[Answer]:
-        return list(ordered_map(function, jobs, threads=self._threads if len(jobs) > 1 else 1))
 
     def _evaluate(self, state: _State, loss: int) -> None:
         lay, limits = self.layout, kernels.squared_limits(self._model_ids, state.params)
@@ -216,9 +210,11 @@ class BundleSystem:
 
     def _eliminate(self, damping: float) -> None:
         """Inverts the blocks of points and takes them out of the reduced system."""
-        now = self._state
         self._run(lambda job: invert_blocks(*job, self._V, damping, self._M), self.layout.point_chunks)
-        self._reduced.eliminate(now.centers[self.layout.slot_frame], now.points3D, self._M, self._g)
+        self._reduced.eliminate(self._row_centers(), self._state.points3D, self._M, self._g)
+
+    def _row_centers(self) -> FloatArray:
+        return self._state.frames.centers.take(self.layout.slot_frame, axis=0)
 
 
 class Information(NamedTuple):
@@ -236,21 +232,61 @@ class Information(NamedTuple):
     M: np.ndarray
 
 
+class _Frames(NamedTuple):
+    """Poses (F, 4), (F, 3), (F, 3, 3) and (F, 3) of the frames; what `turn_poses` moves."""
+
+    wxyz: np.ndarray
+    centers: np.ndarray
+    rotations: np.ndarray
+    translations: np.ndarray
+
+    @property
+    def poses(self) -> Rigid3:
+        return Rigid3(Rotation3(self.wxyz.copy()), self.translations.copy())
+
+    def copy(self) -> _Frames:
+        return _Frames(*(part.copy() for part in self))
+
+
+class _Places(NamedTuple):
+    """Where a step (rows, 6) has what belongs to parameters, sensors and biases.
+
+    Attributes:
+        cells, entries: camera and column of each parameter, and its number among those of the step.
+        sensors, sensor_rows: sensors that move and their rows; bias_rows: of the biases.
+    """
+
+    cells: tuple[np.ndarray, np.ndarray]
+    entries: np.ndarray
+    sensors: np.ndarray
+    sensor_rows: np.ndarray
+    bias_rows: np.ndarray
+
+    @staticmethod
+    def of(layout: Layout) -> _Places:
+        shared, poses = layout.shared, len(layout.slot_frame)
+        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        mounted = np.flatnonzero(shared.sensor >= 0)
+        return _Places(
+            (shared.camera[row], shared.columns[row, place]),
+            BLOCK * (poses + row) + place,
+            shared.sensor[mounted],
+            poses + mounted,
+            poses + np.flatnonzero(shared.bias >= 0),
+        )
+
+
 @dataclasses.dataclass(slots=True)
 class _State:
     """Parameters as kernels want them; what is constant is the same in both states of a system.
 
     Attributes:
-        wxyz, centers: (F, 4) and (F, 3) of the frames.
-        frames: their poses; images: rotations (I, 3, 3), translations (I, 3) and poses of the images.
+        images: rotations (I, 3, 3), translations (I, 3) and centres (I, 3) of the images; without rigs, of the frames.
     """
 
-    wxyz: np.ndarray
-    centers: np.ndarray
-    frames: Rigid3
+    frames: _Frames
+    images: tuple[np.ndarray, np.ndarray, np.ndarray]
     sensors: Rigid3
-    rigs: RigArrays | None
-    images: tuple[np.ndarray, np.ndarray, Rigid3]
     params: np.ndarray
     points3D: np.ndarray
     biases: np.ndarray
@@ -259,55 +295,48 @@ class _State:
     @staticmethod
     def of(problem: BundleProblem) -> _State:
         rigs, poses = problem.rigs, problem.cams_from_world
-        frames = poses if rigs is None else rigs.rigs_from_world
+        moving = poses if rigs is None else rigs.rigs_from_world
+        turns = moving.rotation.matrix
+        centers = -np.einsum("fji,fj->fi", turns, moving.translation)
+        frames = _Frames(moving.rotation.wxyz.copy(), centers, turns, moving.translation.copy())
         return _State(
-            frames.rotation.wxyz.copy(),
-            frames.center.copy(),
             frames,
+            (frames.rotations, frames.translations, frames.centers) if rigs is None else _as_arrays(poses),
             Rigid3.identity((0,)) if rigs is None else rigs.sensors_from_rig,
-            rigs,
-            _as_arrays(poses),
             problem.camera_params.copy(),
             problem.points3D.copy(),
             np.zeros((bias_count(problem.pose_priors), 3)),
         )
 
     def copy(self) -> _State:
-        copied = {name: getattr(self, name).copy() for name in ("wxyz", "centers", "params", "points3D", "biases")}
-        return dataclasses.replace(self, **copied)
+        parts = {name: getattr(self, name).copy() for name in ("frames", "params", "points3D", "biases")}
+        copied = dataclasses.replace(self, **parts)
+        if self.images[0] is self.frames.rotations:
+            copied.images = copied.frames.rotations, copied.frames.translations, copied.frames.centers
+        return copied
 
-    def move(self, delta: FloatArray, layout: Layout, then: _State) -> None:
+    def mounted(self, rigs: RigArrays) -> RigArrays:
+        """`rigs` where they are now."""
+        return dataclasses.replace(rigs, rigs_from_world=self.frames.poses, sensors_from_rig=self.sensors)
+
+    def move(
+        self, delta: FloatArray, moving: np.ndarray, places: _Places, rigs: RigArrays | None, then: _State
+    ) -> None:
         """Fills `then` with the poses and parameters after a step (rows, 6) of the reduced system."""
-        poses, shared = len(layout.slot_frame), layout.shared
-        moves = np.any(delta[:poses] != 0, axis=1)
-        moving, still = layout.slot_frame[moves], layout.slot_frame[~moves]
-        kernels.turn_poses(moving, delta[:poses][moves], self.wxyz, self.centers, then.wxyz, then.centers)
-        then.wxyz[still], then.centers[still] = self.wxyz[still], self.centers[still]
-        then.frames = _moved_poses(self.frames, moving, then.wxyz, then.centers)
-        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
-        cells = shared.camera[row], shared.columns[row, place]
-        then.params[cells] = self.params[cells] + delta[poses + row, place]
-        then.biases[:] = self.biases + delta[poses + np.flatnonzero(shared.bias >= 0), :3]
-        if self.rigs is None:
-            then.images = _as_arrays(then.frames)
-            return
-        mounted = np.flatnonzero(shared.sensor >= 0)
-        then.sensors = _shifted(self.sensors, shared.sensor[mounted], delta[poses + mounted])
-        then.rigs = dataclasses.replace(self.rigs, rigs_from_world=then.frames, sensors_from_rig=then.sensors)
-        then.images = _as_arrays(then.rigs.cams_from_world)
+        kernels.turn_poses(moving, delta, *self.frames, *then.frames)
+        then.params[places.cells] = self.params[places.cells] + delta.ravel()[places.entries]
+        then.biases[:] = self.biases + delta[places.bias_rows, :3]
+        if rigs is not None:
+            then.sensors = _shifted(self.sensors, places.sensors, delta[places.sensor_rows])
+            then.images = _as_arrays(then.mounted(rigs).cams_from_world)
 
 
-def _as_arrays(poses: Rigid3) -> tuple[np.ndarray, np.ndarray, Rigid3]:
-    return poses.rotation.matrix, poses.translation, poses
+def _as_arrays(poses: Rigid3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return poses.rotation.matrix, poses.translation.copy(), poses.center
 
 
-def _moved_poses(before: Rigid3, moving: np.ndarray, wxyz: np.ndarray, centers: np.ndarray) -> Rigid3:
-    """Poses of which only `moving` are new, those of `wxyz` and `centers`."""
-    turned = Rotation3(wxyz[moving])
-    translations, turns = before.translation.copy(), before.rotation.wxyz.copy()
-    translations[moving] = -np.einsum("kab,kb->ka", turned.matrix, centers[moving])
-    turns[moving] = turned.wxyz
-    return Rigid3(Rotation3(turns), translations)
+def _squared(numbers: FloatArray) -> float:
+    return float((numbers * numbers).sum())
 
 
 def _shifted(sensors: Rigid3, moving: np.ndarray, delta: FloatArray) -> Rigid3:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import collections
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -52,6 +52,23 @@ def ordered_map(
             yield pending.popleft().result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+class Workers:
+    """Threads that are kept for many short calls: to start them takes longer than the work of one.
+
+    They end when this is no longer referred to. A job must not call `map` of its own workers.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.threads = max(threads, 1)
+        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+
+    def map(self, function: Callable[[Item], Result], jobs: Sequence[Item]) -> list[Result]:
+        """`[function(job) for job in jobs]`."""
+        if self._pool is None or len(jobs) < 2:
+            return [function(job) for job in jobs]
+        return list(self._pool.map(function, jobs))
 
 
 def chunk_bounds(count: int, chunks: int) -> list[tuple[int, int]]:

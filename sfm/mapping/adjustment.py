@@ -101,17 +101,17 @@ def _adjust(
 ) -> None:
     """Gathers the observations `rows` with the images, cameras and points that they touch, and writes the result."""
     scene = state.scene
-    images, image_of = np.unique(scene.image[rows], return_inverse=True)
-    tracks, track_of = np.unique(scene.track_of[rows], return_inverse=True)
-    cameras, camera_of = np.unique(scene.image_camera[images], return_inverse=True)
+    images, image_of = _numbered(scene.image[rows], len(scene.image_ids))
+    tracks, track_of = _numbered(scene.track_of[rows], len(state.has_point))
+    cameras, camera_of = _numbered(scene.image_camera[images], len(state.params))
     problem = BundleProblem(
         model_ids=state.model_ids[cameras],
         camera_params=state.params[cameras],
-        image_cameras=camera_of.astype(np.int32),
+        image_cameras=camera_of,
         cams_from_world=Rigid3(Rotation3.from_matrix(state.R[images]), state.t[images]),
         points3D=state.points[tracks],
-        obs_images=image_of.astype(np.int32),
-        obs_points=track_of.astype(np.int32),
+        obs_images=image_of,
+        obs_points=track_of,
         obs_points2D=scene.xy[rows],
         free_params=free_params[cameras],
         free_poses=free_poses[images],
@@ -127,6 +127,15 @@ def _adjust(
     moved = np.flatnonzero(np.any(state.params[cameras] != result.camera_params, axis=1))
     state.params[cameras] = result.camera_params
     state.refresh_rays(cameras[moved].tolist())
+
+
+def _numbered(rows: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that occur, of `count`, ascending, and the number of each among these."""
+    numbers = np.zeros(count, np.int32)
+    numbers[rows] = 1
+    used = np.flatnonzero(numbers)
+    numbers[used] = np.arange(len(used), dtype=np.int32)
+    return used, numbers[rows]
 
 
 def _weighted(problem: BundleProblem, config: BundleConfig, scales: np.ndarray) -> tuple[BundleProblem, BundleConfig]:

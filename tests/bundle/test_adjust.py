@@ -113,6 +113,17 @@ def test_the_final_cost_does_not_depend_on_the_gauge(make_problem, perturbed, rn
     assert adjust(moved, dataclasses.replace(TIGHT, loss=loss)).final_cost == pytest.approx(fixed.final_cost, rel=1e-8)
 
 
+def test_every_step_of_a_free_scene_can_be_solved(make_problem, perturbed, rng):
+    """However small the damping has become that keeps the matrix definite."""
+    problem = perturbed(make_problem(rng, noise_px=1.0), rng)
+    config = BundleConfig(
+        gauge="free", loss="soft_l1", loss_scale_px=0.2, max_iterations=80, relative_cost_tolerance=0.0
+    )  # fmt: skip
+    table = adjust(problem, config).table
+    assert min(row.damping for row in table) < 1e-12
+    assert all(row.step_norm > 0 for row in table[1:])
+
+
 def test_two_cameras_hold_six_and_one_freedoms(make_problem, perturbed, rng):
     start = perturbed(make_problem(rng, noise_px=1.0), rng)
     result = adjust(start)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm.core.execution import available_threads, chunk_bounds, ordered_map
+from sfm.core.execution import Workers, available_threads, chunk_bounds, ordered_map
 
 
 @pytest.mark.parametrize("threads", [0, 1, 2, 5])
@@ -109,3 +109,37 @@ def test_chunks_partition_the_range_evenly(count, chunks):
 
 def test_at_least_one_thread_is_available():
     assert 1 <= available_threads() <= 4096
+
+
+@pytest.mark.parametrize("threads", [0, 1, 2, 5])
+def test_workers_return_results_in_the_order_of_the_jobs(threads):
+    """Job 0 waits for job 1 wherever two run at once, so completion order is not job order."""
+    workers = Workers(threads)
+    for _ in range(3):
+        second_done = threading.Event()
+
+        def work(k, second_done=second_done):
+            if k == 0 and threads > 1:
+                assert second_done.wait(30)
+            if k == 1:
+                second_done.set()
+            return k * k
+
+        assert workers.map(work, range(20)) == [k * k for k in range(20)]
+
+
+def test_threads_of_workers_end_with_them():
+    before = set(threading.enumerate())
+    workers = Workers(3)
+    workers.map(abs, range(20))
+    mine = set(threading.enumerate()) - before
+    assert mine
+    del workers
+    for thread in mine:
+        thread.join(30)
+        assert not thread.is_alive()
+
+
+def test_an_exception_of_a_worker_is_raised():
+    with pytest.raises(ZeroDivisionError):
+        Workers(2).map(lambda k: 1 / k, [1, 0])

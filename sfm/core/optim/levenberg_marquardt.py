@@ -26,7 +26,8 @@ StopReason: TypeAlias = Literal["relative_cost", "gradient", "step", "max_iterat
 _INITIAL_DAMPING = 1e-4
 _LEAST_FACTOR = 0.2
 _MIN_DAMPING, _MAX_DAMPING = 1e-10, 1e20
-"""Below 1e-10 the damping no longer speeds anything up, and with a free gauge robust losses take twice the steps."""
+"""Less changes no step, but rounding makes a matrix indefinite in directions that are free, as those of a scene are:
+with 1e-16 robust losses take up to twice the steps."""
 _FREE_DAMPING = 1.0
 """Above it a step is less than half of the undamped one, and a small decrease says nothing."""
 _MIN_GAIN = 1e-3
