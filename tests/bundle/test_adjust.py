@@ -120,7 +120,7 @@ def test_every_step_of_a_free_scene_can_be_solved(make_problem, perturbed, rng):
         gauge="free", loss="soft_l1", loss_scale_px=0.2, max_iterations=80, relative_cost_tolerance=0.0
     )  # fmt: skip
     table = adjust(problem, config).table
-    assert min(row.damping for row in table) < 1e-12
+    assert min(row.damping for row in table) <= 1e-10
     assert all(row.step_norm > 0 for row in table[1:])
 
 
