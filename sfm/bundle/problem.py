@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -169,7 +170,8 @@ class BundleConfig:
     loss: Loss = "trivial"
     """What a residual costs; trivial is plain least squares, right where outliers have been filtered."""
     loss_scale_px: float = 1.0
-    """Residual in px from which a robust loss grows more slowly."""
+    """Residual from which a robust loss grows more slowly: in px, or in standard deviations where `obs_sigmas` has
+    some."""
     graduated: bool = False
     """Begin with a scale as wide as the worst residual and narrow it by factors of two, so that a loss which gives up
     on large residuals, tukey or truncated, does not give up on those that only a bad start makes large."""
@@ -180,13 +182,14 @@ class BundleConfig:
     gradient_tolerance: float = 1e-10
     """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
     gauge: Literal["two_cameras", "free"] = "two_cameras"
-    """Hold one pose and one direction of motion of a second where the data leave them open, or hold nothing."""
+    """Where the data leave the frame of the scene open: keep one pose and one coordinate of a second centre as they
+    were, or leave the scene wherever the steps took it. Covariances are relative to these two, or spread over all."""
     solver: SolverChoice = "auto"
     """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
-        if not self.loss_scale_px > 0:
-            raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
+        if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
+            raise ValueError(f"loss_scale_px must be positive and finite, like its square, got {self.loss_scale_px}")
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
         if self.solver not in get_args(SolverChoice):
@@ -201,7 +204,8 @@ class BundleResult(Value):
 
     Attributes:
         problem: the problem with its new cameras, poses and points; what was not free is the same to the last bit.
-        initial_cost, final_cost: ½ Σ ρ in px² over the observations that take part.
+        initial_cost, final_cost: ½ Σ ρ of the observations that take part, in px² or, where `obs_sigmas` has standard
+            deviations, without a unit; plus what priors add.
         reason: why the iteration ended.
         invalid: observations without a projection at the start (behind the camera, not finite); they take no part.
         lost: observations that lost their projection on the way; each is charged like the worst at the start.

@@ -185,7 +185,8 @@ def test_arrays_that_do_not_fit_are_refused(make_problem, rng, change):
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="loss_scale_px"):
-        BundleConfig(loss_scale_px=0.0)
+    for scale in (0.0, -1.0, 1e-200, 1e200, np.inf, np.nan):
+        with pytest.raises(ValueError, match="loss_scale_px"):
+            BundleConfig(loss_scale_px=scale)
     with pytest.raises(ValueError, match="max_iterations"):
         BundleConfig(max_iterations=-1)
