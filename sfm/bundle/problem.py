@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, Int32
 from sfm.bundle.priors import PointPrior, Prior, check_rows
 from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
+from sfm.core.cameras.models import model_by_id
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
@@ -83,8 +84,8 @@ class BundleProblem(Value):
         priors: what is known of poses and points besides.
 
     Raises:
-        ValueError: shapes disagree, a row does not exist, a parameter that the model lacks is free, or a standard
-            deviation is not positive.
+        ValueError: shapes disagree, a row or a model does not exist, a parameter that the model lacks is free, a
+            standard deviation is not positive, an expected parameter is not finite, or poses are not those of the rigs.
     """
 
     model_ids: Int32[np.ndarray, " C"]
@@ -125,8 +126,7 @@ class BundleProblem(Value):
         for name in ("prior_params", "prior_sigmas"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name), (cameras, MAX_PARAMS)))
-        if self.prior_sigmas is not None and not np.all(self.prior_sigmas > 0):
-            raise ValueError("prior_sigmas must be positive")
+        self._check_params()
         if self.obs_sigmas is not None:
             object.__setattr__(self, "obs_sigmas", readonly(self.obs_sigmas, (observations,), np.float64))
             if not np.all((self.obs_sigmas > 0) & np.isfinite(self.obs_sigmas)):
@@ -149,6 +149,18 @@ class BundleProblem(Value):
     def point_priors(self) -> tuple[PointPrior, ...]:
         """The priors that are about points."""
         return tuple(prior for prior in self.priors if isinstance(prior, PointPrior))
+
+    def _check_params(self) -> None:
+        for number in np.unique(self.model_ids):
+            model = model_by_id(int(number))
+            if self.free_params[self.model_ids == number, len(model.param_names) :].any():
+                raise ValueError(f"free_params must be False behind the {len(model.param_names)} of {model.name}")
+        if self.prior_params is None or self.prior_sigmas is None:
+            return
+        if not np.all(self.prior_sigmas > 0):
+            raise ValueError("prior_sigmas must be positive")
+        if not np.all(np.isfinite(self.prior_params[self.free_params & (self.prior_sigmas < np.inf)])):
+            raise ValueError("prior_params must be finite where a free parameter has a standard deviation")
 
     def _check_rigs(self, rigs: RigArrays) -> None:
         if len(rigs.image_frames) != len(self.image_cameras):
