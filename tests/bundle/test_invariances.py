@@ -8,10 +8,11 @@ import itertools
 import numpy as np
 import pytest
 
-from sfm.bundle import BundleConfig, BundleProblem, adjust
+from sfm.bundle import BundleConfig, BundleProblem, adjust, squared_errors
 from sfm.bundle.priors import DistancePrior, GravityPrior, PointPrior, PositionPrior
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
+from sfm.core.geometry.similarity import Sim3, estimate_similarity
 from sfm.core.optim.losses import LOSSES
 from tests.bundle.conftest import build, perturb
 from tests.bundle.test_rigs import build_rig, disturbed
@@ -163,3 +164,38 @@ def test_all_solvers_find_the_same_minimum(rng, make):
         results["sparse"].problem.camera_params, dense.problem.camera_params, rtol=1e-5, atol=1e-5
     )
     assert results["sparse"].iterations <= dense.iterations + 3
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_the_number_of_threads_changes_no_bit_of_any_solver(rng, solver):
+    """Enough observations for several chunks of images and points."""
+    problem = build(rng, images=24, points=1600, cameras=24, seen=0.5, model="SIMPLE_RADIAL", free_params=(0, 3))
+    start = perturb(problem, rng, 0.003)
+    config = BundleConfig(max_iterations=2, solver=solver, loss="huber")
+    one, others = adjust(start, config), [adjust(start, config, threads=threads) for threads in (2, 3, 7)]
+    assert len(start.obs_images) > 2 * 8192
+    for other in others:
+        assert one.table == other.table
+        assert np.array_equal(one.problem.points3D, other.problem.points3D)
+        assert np.array_equal(one.problem.camera_params, other.problem.camera_params)
+        assert np.array_equal(one.problem.cams_from_world.matrix, other.problem.cams_from_world.matrix)
+
+
+@pytest.mark.parametrize("make", [loop, rig])
+def test_the_gauge_of_two_cameras_is_one_similarity_away_from_the_free_one(rng, make):
+    """One pose and one coordinate of a second centre are as they were."""
+    start = make(rng)
+    config = dataclasses.replace(TIGHT, relative_cost_tolerance=1e-9)
+    held, free = adjust(start, config), adjust(start, dataclasses.replace(config, gauge="free"))
+    assert held.final_cost == free.final_cost
+    motion = estimate_similarity(free.problem.points3D, held.problem.points3D)
+    assert isinstance(motion, Sim3)
+    np.testing.assert_allclose(motion @ free.problem.points3D, held.problem.points3D, atol=1e-9)
+    before, after = (problem.cams_from_world.center for problem in (start, held.problem))
+    same = np.flatnonzero(np.abs(after - before).max(axis=1) < 1e-12)
+    assert len(same) == 1
+    rows, axes = np.nonzero(np.abs(after - before) < 1e-12)
+    baselines = np.abs(before - before[same[0]])
+    assert any(axis == np.argmax(baselines[row]) for row, axis in zip(rows, axes, strict=True) if row != same[0])
+    from_held = squared_errors(held.problem)
+    np.testing.assert_allclose(from_held, squared_errors(free.problem), rtol=1e-6, atol=1e-9)
