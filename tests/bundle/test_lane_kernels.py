@@ -66,7 +66,7 @@ def workspace(rng: np.random.Generator) -> Workspace:
     observed[8] = points2D[8]
     rows = w.reshape(-1, LANES)
     rows[[camera_lanes.U, camera_lanes.V]] = points2D.T
-    rows[camera_lanes.OK] = ~np.isin(np.arange(LANES), UNSEEN)
+    rows[camera_lanes.OK] = ~np.isin(np.arange(LANES), (*UNSEEN, ENDED[1]))
     rows[camera_lanes.BY_POINT : camera_lanes.BY_POINT + 6] = by_point.reshape(LANES, 6).T
     rows[lanes._WORLD : lanes._WORLD + 3] = world.T
     rows[lanes._OBSERVED : lanes._OBSERVED + 2] = observed.T
