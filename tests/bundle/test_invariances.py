@@ -199,3 +199,18 @@ def test_the_gauge_of_two_cameras_is_one_similarity_away_from_the_free_one(rng, 
     assert any(axis == np.argmax(baselines[row]) for row, axis in zip(rows, axes, strict=True) if row != same[0])
     from_held = squared_errors(held.problem)
     np.testing.assert_allclose(from_held, squared_errors(free.problem), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("free", ["poses", "points", "params", "poses points", "poses params", "points params"])
+def test_any_part_may_be_constant(rng, free, solver):
+    truth = build(rng, images=5, points=40, model="SIMPLE_RADIAL", cameras=2, free_params=(0, 3))
+    truth = dataclasses.replace(
+        truth,
+        free_poses=np.full(5, "poses" in free),
+        free_points=np.full(40, "points" in free),
+        free_params=truth.free_params & ("params" in free),
+    )
+    result = adjust(perturb(truth, rng, 0.005), dataclasses.replace(TIGHT, solver=solver, gauge="free"))
+    assert result.initial_cost > 10
+    assert result.final_cost < 1e-12
