@@ -9,8 +9,8 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from sfm.bundle.priors import PointPrior, Prior, check_rows
-from sfm.core.arrays import FloatArray, Value, readonly
+from sfm.bundle.priors import PointPrior, Prior, check_rows, where_finite
+from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.models import model_by_id
 from sfm.core.geometry.rigid import Rigid3
@@ -142,13 +142,21 @@ class BundleProblem(Value):
 
     @property
     def pose_priors(self) -> tuple[Prior, ...]:
-        """The priors that are about poses."""
-        return tuple(prior for prior in self.priors if not isinstance(prior, PointPrior))
+        """The priors that are about poses; of a pose or a point that is not finite nothing is expected."""
+        finite = self._finite
+        return tuple(where_finite(prior, *finite) for prior in self.priors if not isinstance(prior, PointPrior))
 
     @property
     def point_priors(self) -> tuple[PointPrior, ...]:
         """The priors that are about points."""
-        return tuple(prior for prior in self.priors if isinstance(prior, PointPrior))
+        finite = self._finite
+        return tuple(where_finite(prior, *finite) for prior in self.priors if isinstance(prior, PointPrior))
+
+    @property
+    def _finite(self) -> tuple[BoolArray, BoolArray]:
+        """Which poses (I,) and points (P,) are finite; quaternions always are."""
+        translations = self.cams_from_world.translation
+        return np.all(np.isfinite(translations), axis=1), np.all(np.isfinite(self.points3D), axis=1)
 
     def _check_params(self) -> None:
         for number in np.unique(self.model_ids):
