@@ -287,18 +287,23 @@ def test_points_settle_where_they_keep_the_most_projections(slow, rng):
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 0.99e-4, 1.01e-4, 0.3, 3.1, 20.0])
 def test_poses_turn_on_the_right_and_their_centres_go_against_the_shift(rng, angle):
     before, centers = Rotation3.exp(rng.normal(size=(6, 3))), rng.normal(size=(6, 3))
-    delta = rng.normal(size=(3, 6))
+    delta, frames = rng.normal(size=(4, 6)), np.array([4, 0, 3, 1], np.int32)
     delta[:, :3] *= angle / np.linalg.norm(delta[:, :3], axis=1, keepdims=True)
-    frames = np.array([4, 0, 3], np.int32)
-    wxyz, moved = before.wxyz.copy(), centers.copy()
-    kernels.turn_poses(frames, delta, before.wxyz.copy(), centers, wxyz, moved)
-    turns, places = before.matrix, centers.copy()
+    delta[2] = 0
+    poses = before.wxyz.copy(), centers, before.matrix, rng.normal(size=(6, 3))
+    moved = tuple(np.full_like(part, np.nan) for part in poses)
+    kernels.turn_poses(frames, delta, *poses, *moved)
     for k, frame in enumerate(frames):
-        turns[frame] = turns[frame] @ Rotation3.exp(delta[k, :3]).matrix
-        places[frame] -= delta[k, 3:]
-    np.testing.assert_allclose(Rotation3(wxyz).matrix, turns, rtol=0, atol=1e-14 * max(1, angle))
-    np.testing.assert_allclose(np.linalg.norm(wxyz, axis=1), 1, rtol=0, atol=1e-15)
-    np.testing.assert_array_equal(moved, places)
+        R, place = before.matrix[frame] @ Rotation3.exp(delta[k, :3]).matrix, centers[frame] - delta[k, 3:]
+        np.testing.assert_allclose(Rotation3(moved[0][frame]).matrix, R, rtol=0, atol=1e-14 * max(1, angle))
+        np.testing.assert_allclose(np.linalg.norm(moved[0][frame]), 1, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(moved[1][frame], place)
+        if k != 2:
+            np.testing.assert_allclose(moved[2][frame], R, rtol=0, atol=1e-14 * max(1, angle))
+            np.testing.assert_allclose(moved[3][frame], -R @ place, rtol=0, atol=1e-13 * max(1, angle))
+    for part, old in zip(moved, poses, strict=True):
+        assert np.array_equal(part[3], old[3])  # the one that does not move, to the last bit
+        assert np.isnan(part[[2, 5]]).all()
 
 
 def test_a_limit_is_the_square_of_the_radius_within_which_points_have_a_projection():
