@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 
@@ -64,8 +65,8 @@ class MotionConfig:
 
     def __post_init__(self) -> None:
         loss_id(self.loss)
-        if not self.loss_scale_px > 0:
-            raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
+        if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
+            raise ValueError(f"loss_scale_px must be positive and finite, like its square, got {self.loss_scale_px}")
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
 

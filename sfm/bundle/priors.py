@@ -9,12 +9,12 @@ by the standard deviations, so that they add to the squared errors of observatio
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, Int32
 
-from sfm.core.arrays import FloatArray, Value, readonly
+from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
 from sfm.core.optim.losses import Loss, loss_id
 
 _SINGULAR = 1e-12
@@ -167,6 +167,12 @@ class PointPrior(Value):
 
 Prior: TypeAlias = PositionPrior | GravityPrior | DistancePrior
 """What is known of poses."""
+AnyPrior = TypeVar("AnyPrior", bound=PositionPrior | GravityPrior | DistancePrior | PointPrior)
+_COLUMNS = (
+    "images", "first", "second", "points", "positions", "covariances", "directions_in_camera", "sigmas_rad",
+    "distances", "sigmas",
+)  # fmt: skip
+"""What has a row for each measurement of a group."""
 
 
 def covariances_of(sigmas: FloatArray) -> FloatArray:
@@ -212,6 +218,17 @@ def check_rows(priors: tuple[Prior | PointPrior, ...], images: int, points: int)
             rows = getattr(prior, name, None)
             if rows is not None and len(rows) and rows.max() >= count:
                 raise ValueError(f"{name} of {type(prior).__name__} must lie in 0..{count - 1}, got {rows.max()}")
+
+
+def where_finite(prior: AnyPrior, poses: BoolArray, points: BoolArray) -> AnyPrior:
+    """The group without the measurements of what is not finite: of `poses` (I,) and `points` (P,) that are False.
+
+    Nothing can be compared with these, and they do not move.
+    """
+    of_rows = {"images": poses, "first": poses, "second": poses, "points": points}
+    columns = [field.name for field in dataclasses.fields(prior) if field.name in _COLUMNS]
+    keep = np.all([of_rows[name][getattr(prior, name)] for name in columns if name in of_rows], axis=0)
+    return prior if keep.all() else dataclasses.replace(prior, **{name: getattr(prior, name)[keep] for name in columns})
 
 
 def _set(prior: Prior | PointPrior, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from sfm.bundle.priors import PointPrior, Prior, check_rows
-from sfm.core.arrays import FloatArray, Value, readonly
+from sfm.bundle.priors import PointPrior, Prior, check_rows, where_finite
+from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
+from sfm.core.cameras.models import model_by_id
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
@@ -82,8 +84,8 @@ class BundleProblem(Value):
         priors: what is known of poses and points besides.
 
     Raises:
-        ValueError: shapes disagree, a row does not exist, a parameter that the model lacks is free, or a standard
-            deviation is not positive.
+        ValueError: shapes disagree, a row or a model does not exist, a parameter that the model lacks is free, a
+            standard deviation is not positive, an expected parameter is not finite, or poses are not those of the rigs.
     """
 
     model_ids: Int32[np.ndarray, " C"]
@@ -124,8 +126,7 @@ class BundleProblem(Value):
         for name in ("prior_params", "prior_sigmas"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name), (cameras, MAX_PARAMS)))
-        if self.prior_sigmas is not None and not np.all(self.prior_sigmas > 0):
-            raise ValueError("prior_sigmas must be positive")
+        self._check_params()
         if self.obs_sigmas is not None:
             object.__setattr__(self, "obs_sigmas", readonly(self.obs_sigmas, (observations,), np.float64))
             if not np.all((self.obs_sigmas > 0) & np.isfinite(self.obs_sigmas)):
@@ -141,13 +142,33 @@ class BundleProblem(Value):
 
     @property
     def pose_priors(self) -> tuple[Prior, ...]:
-        """The priors that are about poses."""
-        return tuple(prior for prior in self.priors if not isinstance(prior, PointPrior))
+        """The priors that are about poses; of a pose or a point that is not finite nothing is expected."""
+        finite = self._finite
+        return tuple(where_finite(prior, *finite) for prior in self.priors if not isinstance(prior, PointPrior))
 
     @property
     def point_priors(self) -> tuple[PointPrior, ...]:
         """The priors that are about points."""
-        return tuple(prior for prior in self.priors if isinstance(prior, PointPrior))
+        finite = self._finite
+        return tuple(where_finite(prior, *finite) for prior in self.priors if isinstance(prior, PointPrior))
+
+    @property
+    def _finite(self) -> tuple[BoolArray, BoolArray]:
+        """Which poses (I,) and points (P,) are finite; quaternions always are."""
+        translations = self.cams_from_world.translation
+        return np.all(np.isfinite(translations), axis=1), np.all(np.isfinite(self.points3D), axis=1)
+
+    def _check_params(self) -> None:
+        for number in np.unique(self.model_ids):
+            model = model_by_id(int(number))
+            if self.free_params[self.model_ids == number, len(model.param_names) :].any():
+                raise ValueError(f"free_params must be False behind the {len(model.param_names)} of {model.name}")
+        if self.prior_params is None or self.prior_sigmas is None:
+            return
+        if not np.all(self.prior_sigmas > 0):
+            raise ValueError("prior_sigmas must be positive")
+        if not np.all(np.isfinite(self.prior_params[self.free_params & (self.prior_sigmas < np.inf)])):
+            raise ValueError("prior_params must be finite where a free parameter has a standard deviation")
 
     def _check_rigs(self, rigs: RigArrays) -> None:
         if len(rigs.image_frames) != len(self.image_cameras):
@@ -169,7 +190,8 @@ class BundleConfig:
     loss: Loss = "trivial"
     """What a residual costs; trivial is plain least squares, right where outliers have been filtered."""
     loss_scale_px: float = 1.0
-    """Residual in px from which a robust loss grows more slowly."""
+    """Residual from which a robust loss grows more slowly: in px, or in standard deviations where `obs_sigmas` has
+    some."""
     graduated: bool = False
     """Begin with a scale as wide as the worst residual and narrow it by factors of two, so that a loss which gives up
     on large residuals, tukey or truncated, does not give up on those that only a bad start makes large."""
@@ -180,13 +202,14 @@ class BundleConfig:
     gradient_tolerance: float = 1e-10
     """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
     gauge: Literal["two_cameras", "free"] = "two_cameras"
-    """Hold one pose and one direction of motion of a second where the data leave them open, or hold nothing."""
+    """Where the data leave the frame of the scene open: keep one pose and one coordinate of a second centre as they
+    were, or leave the scene wherever the steps took it. Covariances are relative to these two, or spread over all."""
     solver: SolverChoice = "auto"
     """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
-        if not self.loss_scale_px > 0:
-            raise ValueError(f"loss_scale_px must be positive, got {self.loss_scale_px}")
+        if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
+            raise ValueError(f"loss_scale_px must be positive and finite, like its square, got {self.loss_scale_px}")
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
         if self.solver not in get_args(SolverChoice):
@@ -201,7 +224,8 @@ class BundleResult(Value):
 
     Attributes:
         problem: the problem with its new cameras, poses and points; what was not free is the same to the last bit.
-        initial_cost, final_cost: ½ Σ ρ in px² over the observations that take part.
+        initial_cost, final_cost: ½ Σ ρ of the observations that take part, in px² or, where `obs_sigmas` has standard
+            deviations, without a unit; plus what priors add.
         reason: why the iteration ended.
         invalid: observations without a projection at the start (behind the camera, not finite); they take no part.
         lost: observations that lost their projection on the way; each is charged like the worst at the start.

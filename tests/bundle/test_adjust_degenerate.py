@@ -176,6 +176,16 @@ def test_a_point_that_would_pass_through_a_camera_does_not_stop_the_rest(make_pr
         {"obs_sigmas": np.array([1.0, 0.0])},
         {"obs_sigmas": np.array([1.0, np.inf])},
         {"obs_sigmas": np.ones(3)},
+        {"model_ids": np.array([7], np.int32)},
+        {"free_params": np.isin(np.arange(12), (0, 4))[None]},
+        {"prior_params": np.zeros((1, 12))},
+        {"prior_params": np.zeros((1, 12)), "prior_sigmas": np.zeros((1, 12))},
+        {"prior_params": np.zeros((1, 12)), "prior_sigmas": np.full((1, 12), np.nan)},
+        {
+            "prior_params": np.full((1, 12), np.nan),
+            "prior_sigmas": np.ones((1, 12)),
+            "free_params": np.arange(12)[None] == 0,
+        },
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(make_problem, rng, change):
@@ -185,7 +195,8 @@ def test_arrays_that_do_not_fit_are_refused(make_problem, rng, change):
 
 
 def test_settings_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="loss_scale_px"):
-        BundleConfig(loss_scale_px=0.0)
+    for scale in (0.0, -1.0, 1e-200, 1e200, np.inf, np.nan):
+        with pytest.raises(ValueError, match="loss_scale_px"):
+            BundleConfig(loss_scale_px=scale)
     with pytest.raises(ValueError, match="max_iterations"):
         BundleConfig(max_iterations=-1)

@@ -132,3 +132,36 @@ def test_a_prior_about_an_image_that_is_not_there_is_refused(rng):
     prior = PositionPrior.of_sigmas(np.array([9], np.int32), np.zeros((1, 3)), 1.0)
     with pytest.raises(ValueError, match="images"):
         dataclasses.replace(problem, priors=(prior,))
+
+
+@pytest.mark.parametrize("what", ["pose", "point"])
+def test_nothing_is_expected_of_what_is_not_finite(rng, what):
+    """As if these measurements had not been made."""
+    problem = build(rng, images=5, points=40, noise_px=0.5)
+    images, points = np.arange(5, dtype=np.int32), np.arange(3, dtype=np.int32)
+    centers, down = problem.cams_from_world.center, np.array([0.0, 1.0, 0.0])
+    directions, ones = problem.cams_from_world.rotation.matrix @ down, np.ones(4)
+
+    def priors(kept, placed):
+        pairs = images[:4][kept[:4] & kept[1:]]
+        return (
+            PositionPrior.of_sigmas(images[kept], centers[kept] + 0.02, 0.05, bias_sigma=0.5),
+            GravityPrior(images[kept], directions[kept], np.full(int(kept.sum()), 0.02), down),
+            DistancePrior(pairs, pairs + 1, ones[: len(pairs)], ones[: len(pairs)]),
+            PointPrior.of_sigmas(points[placed], problem.points3D[points[placed]] + 0.01, 0.02),
+        )
+
+    kept, placed = np.ones(5, bool), np.ones(3, bool)
+    translation, points3D = problem.cams_from_world.translation.copy(), problem.points3D.copy()
+    if what == "pose":
+        translation[2], kept[2] = np.nan, False
+    else:
+        points3D[1], placed[1] = np.nan, False
+    poses = Rigid3(problem.cams_from_world.rotation, translation)
+    broken = dataclasses.replace(problem, cams_from_world=poses, points3D=points3D)
+    config = BundleConfig(gauge="free")
+    found = adjust(dataclasses.replace(broken, priors=priors(np.ones(5, bool), np.ones(3, bool))), config)
+    expected = adjust(dataclasses.replace(broken, priors=priors(kept, placed)), config)
+    assert found.table == expected.table
+    assert found.final_cost < found.initial_cost
+    assert np.array_equal(found.problem.points3D, expected.problem.points3D, equal_nan=True)

@@ -20,12 +20,14 @@ def loss_and_weight(kind, scale, s):
         return 2.0 * scale * r - a2, scale / r
     if kind == SOFT_L1:
         root = math.sqrt(1.0 + s / a2)
-        return 2.0 * a2 * (root - 1.0), 1.0 / root
+        # The plain form cancels far below the scale; the other is not a number where s is infinite.
+        rho = 2.0 * s / (1.0 + root) if s < a2 else 2.0 * a2 * (root - 1.0)
+        return rho, 1.0 / root
     if kind == CAUCHY:
         return a2 * math.log1p(s / a2), 1.0 / (1.0 + s / a2)
     if kind == TUKEY:
-        rest = max(1.0 - s / a2, 0.0)
-        return a2 / 3.0 * (1.0 - rest * rest * rest), rest * rest
+        x = min(s / a2, 1.0)
+        return a2 * x * (1.0 - x * (1.0 - x / 3.0)), (1.0 - x) * (1.0 - x)
     if kind == TRUNCATED and s > a2:
         return a2, 0.0
     return s, 1.0

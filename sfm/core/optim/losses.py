@@ -65,12 +65,13 @@ def evaluate_loss(loss: Loss, squared_residuals: FloatArray, scale: float = 1.0)
             rho, weight = np.where(s <= 1, s, 2 * root - 1), 1 / root
         case "soft_l1":
             root = np.sqrt(1 + s)
-            rho, weight = 2 * (root - 1), 1 / root
+            near = np.minimum(s, 1.0)  # where root − 1 would cancel
+            rho, weight = np.where(s < 1, 2 * near / (1 + np.sqrt(1 + near)), 2 * (root - 1)), 1 / root
         case "cauchy":
             rho, weight = np.log1p(s), 1 / (1 + s)
         case "tukey":
-            rest = np.maximum(1 - s, 0.0)
-            rho, weight = (1 - rest**3) / 3, rest**2
+            near = np.minimum(s, 1.0)
+            rho, weight = near * (1 - near * (1 - near / 3)), (1 - near) ** 2
         case "truncated":
             rho, weight = np.minimum(s, 1.0), (s <= 1) * 1.0
     return np.asarray(scale**2 * rho), np.asarray(weight)

@@ -30,7 +30,7 @@ _ALWAYS_DENSE_SHARE = 0.5
 _WORTH_SPARSE = 0.75
 """Of the time of a dense factor, below which a sparse one is taken: where they are close, it needs more memory."""
 _DENSE_SECONDS_PER_OPERATION, _DENSE_SECONDS_PER_ENTRY = 1.1e-11, 1.5e-9
-"""Measured on the core on which `that of the fronts` was."""
+"""Measured on the same core as the times of fronts in `ordering`."""
 
 
 @runtime_checkable

@@ -52,6 +52,26 @@ def test_losses_start_as_the_square_and_never_exceed_it(loss):
 
 
 @pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("scale", [1e3, 1e6, 1e8])
+def test_far_below_their_scale_losses_are_the_square_to_the_last_digits(loss, scale):
+    for s in (1e-6, 0.1, 7.0):
+        x = s / scale**2
+        first_terms = {"soft_l1": 1 - x / 4, "cauchy": 1 - x / 2, "tukey": 1 - x}
+        expected = s * first_terms.get(loss, 1.0)
+        assert loss_and_weight(loss_id(loss), scale, s)[0] == pytest.approx(expected, rel=1e-10)
+        assert float(evaluate_loss(loss, np.array(s), scale)[0]) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_of_infinite_residuals_are_numbers_or_infinite(loss):
+    rho, weight = loss_and_weight(loss_id(loss), 2.0, np.inf)
+    expected = {"tukey": 4 / 3, "truncated": 4.0}.get(loss, np.inf)
+    assert rho == pytest.approx(expected)
+    assert weight == (1 if loss == "trivial" else 0)
+    assert evaluate_loss(loss, np.array(np.inf), 2.0)[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("loss", LOSSES)
 def test_the_kernel_equals_the_arrays(loss):
     for s in SQUARED:
         rho, weight = evaluate_loss(loss, np.array(s), 2.0)

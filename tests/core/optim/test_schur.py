@@ -72,8 +72,8 @@ class Problem:
         diagonal = np.zeros((self.rows, 6))
         for first, last in ranges:
             schur.eliminate(
-                first, last, narrow, *self.couplings, self.centers, self.X, self.M, self.g,
-                pattern.offsets, pattern.columns, blocks, side, diagonal,
+                first, last, narrow, *self.couplings, self.centers, self.X, self.M, self.g, pattern.offsets,
+                pattern.columns, blocks, side, diagonal,
             )  # fmt: skip
         return blocks[:, :, :6], side[:, :6], diagonal
 
