@@ -8,20 +8,21 @@ import numba as nb
 import numpy as np
 
 from sfm.bundle import _lane_kernels as lanes
-from sfm.core.cameras._kernels import MAX_PARAMS, distortion_limit, project_point
+from sfm.core.cameras._kernels import MAX_PARAMS, distortion_limit
 from sfm.core.cameras._lane_kernels import BY_PARAMS, LANES, fill_by_param, project_lanes
-from sfm.core.optim._loss_kernels import loss_and_weight
 from sfm.core.optim._schur_kernels import damped_diagonal
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def linearize_images(
+def evaluate_images(
     first, last, offsets, point, place, observed, precision, slot, camera, model_ids, limits, column_count, columns,
-    R, t, centers, params, X, loss, scale, lost_cost, out, h, F, G, f,
+    R, t, centers, params, X, loss, scale, lost_cost, derive, costs, out, h, F, G, f,
 ):  # fmt: skip
     """Cost ½ Σ ρ of the images `first:last` and their share of the normal equations; see `system`.
 
     Args:
+        derive: whether there is more to do than to fill `costs` (n,) with 2 × `lost_cost` or ρ of each observation, in
+            the order by points; if so, these are left alone.
         offsets, point, place: observations by image (I + 1,), their points and their places in the order by points.
         slot, centers: row of each image's frame, −1 where it does not move, and the centres by row.
         column_count, columns: how many free columns an image shares with others, and which (I, k): parameters, or
@@ -35,10 +36,13 @@ def linearize_images(
     for i in range(first, last):
         c, own, count = camera[i], slot[i] >= 0, column_count[i]
         for begin in range(offsets[i], offsets[i + 1], LANES):
-            lanes.fetch(begin, offsets[i + 1], point, observed, precision, X, w)
-            lanes.transform(R[i], t[i], w)
+            lanes.fetch(begin, offsets[i + 1], point, observed, precision, X, R[i], t[i], w)
             project_lanes(model_ids[c], params[c], limits[c], w)
             lanes.weigh(loss, scale, lost_cost, w)
+            if not derive:
+                for n in range(min(LANES, offsets[i + 1] - begin)):
+                    costs[place[begin + n]] = w[lanes.COST * LANES + n]
+                continue
             lanes.derive_by_point(R[i], w)
             for k in range(count):
                 column = columns[i, k]
@@ -76,24 +80,6 @@ def _tangent_rows(a):
     if a < 3:
         return lanes.BY_TURN + a, lanes.BY_TURN + 3 + a
     return lanes.BY_POINT_IN_WORLD + a - 3, lanes.BY_POINT_IN_WORLD + a
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def costs_of_images(
-    first, last, offsets, point, place, observed, precision, camera, model_ids, limits, R, t, params, X,
-    loss, scale, out,
-):  # fmt: skip
-    """ρ of the observations of the images `first:last`, in the order by points; NaN where there is no projection."""
-    w = np.zeros(lanes.ROWS * LANES)
-    for i in range(first, last):
-        c = camera[i]
-        for begin in range(offsets[i], offsets[i + 1], LANES):
-            lanes.fetch(begin, offsets[i + 1], point, observed, precision, X, w)
-            lanes.transform(R[i], t[i], w)
-            project_lanes(model_ids[c], params[c], limits[c], w)
-            lanes.weigh(loss, scale, np.nan, w)
-            for n in range(min(LANES, offsets[i + 1] - begin)):
-                out[place[begin + n]] = w[lanes.COST * LANES + n]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -162,54 +148,44 @@ def move_points(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def settle_points(
-    first, last, offsets, source, image, observed, precision, camera, model_ids, R, t, params, X, loss, scale,
-    lost_cost, damping, V, g, costs, moved, totals,
-):  # fmt: skip
+def settle_points(first, last, offsets, X, lost_cost, damping, V, g, costs, costs_here, moved, totals):
     """Adds up the points `first:last` of a trial, and leaves in its place a point that would lose projections there.
 
-    `costs` holds ρ of each observation at `moved`, `source` where it stands in the order by images.
+    `costs` holds ρ of each observation at `moved`, `costs_here` at `X`, NaN where there is no projection.
     Fills `totals` with the cost, the promised decrease, |δ|², |X|² and the lost projections.
     """
     cost = decrease = step = norm = all_lost = 0.0
     for p in range(first, last):
         if offsets[p] == offsets[p + 1]:
             continue
-        best_cost, best_lost = 0.0, 0
-        for o in range(offsets[p], offsets[p + 1]):
-            if math.isnan(costs[o]):
-                best_cost += lost_cost
-                best_lost += 1
-            else:
-                best_cost += 0.5 * costs[o]
-        if best_lost > 0:
-            here, lost = 0.0, 0
-            for o in range(offsets[p], offsets[p + 1]):
-                i, s = image[o], source[o]
-                c, r = camera[i], R[i]
-                x = r[0, 0] * X[p, 0] + r[0, 1] * X[p, 1] + r[0, 2] * X[p, 2] + t[i, 0]
-                y = r[1, 0] * X[p, 0] + r[1, 1] * X[p, 1] + r[1, 2] * X[p, 2] + t[i, 1]
-                z = r[2, 0] * X[p, 0] + r[2, 1] * X[p, 1] + r[2, 2] * X[p, 2] + t[i, 2]
-                u, v, ok = project_point(model_ids[c], params[c], x, y, z)
-                if ok:
-                    eu, ev = (u - observed[s, 0]) * precision[s], (v - observed[s, 1]) * precision[s]
-                    rho, _ = loss_and_weight(loss, scale, eu * eu + ev * ev)
-                    here += 0.5 * rho
-                else:
-                    here += lost_cost
-                    lost += 1
-            if lost < best_lost:
-                best_cost, best_lost = here, lost
+        there, lost = _cost_of_point(offsets[p], offsets[p + 1], costs, lost_cost)
+        if lost > 0:
+            here, lost_here = _cost_of_point(offsets[p], offsets[p + 1], costs_here, lost_cost)
+            if lost_here < lost:
+                there, lost = here, lost_here
                 moved[p, 0], moved[p, 1], moved[p, 2] = X[p, 0], X[p, 1], X[p, 2]
         s0, s1, s2 = moved[p, 0] - X[p, 0], moved[p, 1] - X[p, 1], moved[p, 2] - X[p, 2]
-        cost += best_cost
-        all_lost += best_lost
+        cost += there
+        all_lost += lost
         decrease -= 0.5 * (g[p, 0] * s0 + g[p, 1] * s1 + g[p, 2] * s2)
         f0, f1, f2 = damped_diagonal(V[p], damping)
         decrease += 0.5 * (f0 * s0 * s0 + f1 * s1 * s1 + f2 * s2 * s2)
         step += s0 * s0 + s1 * s1 + s2 * s2
         norm += X[p, 0] * X[p, 0] + X[p, 1] * X[p, 1] + X[p, 2] * X[p, 2]
     totals[0], totals[1], totals[2], totals[3], totals[4] = cost, decrease, step, norm, all_lost
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _cost_of_point(first, last, costs, lost_cost):
+    """Cost of the observations `first:last`, and how many of them have no projection."""
+    cost, lost = 0.0, 0
+    for o in range(first, last):
+        if math.isnan(costs[o]):
+            cost += lost_cost
+            lost += 1
+        else:
+            cost += 0.5 * costs[o]
+    return cost, lost
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -37,9 +37,9 @@ BY_SENSOR = BY_COLUMN + 2 * _MAX_COLUMNS
 ROWS = BY_SENSOR + 2
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def fetch(first, last, point, observed, precision, points3D, w):
-    """Fills the lanes with the observations `first:last` of an image."""
+@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def fetch(first, last, point, observed, precision, points3D, R, t, w):
+    """Fills the lanes with the observations `first:last` of an image, and with their points in the camera frame."""
     for n in range(LANES):
         o = min(first + n, last - 1)
         p = point[o]
@@ -48,11 +48,6 @@ def fetch(first, last, point, observed, precision, points3D, w):
         w[(_WORLD + 2) * LANES + n] = points3D[p, 2]
         w[_OBSERVED * LANES + n], w[(_OBSERVED + 1) * LANES + n] = observed[o, 0], observed[o, 1]
         w[_PRECISION * LANES + n] = precision[o] if first + n < last else 0.0
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def transform(R, t, w):
-    """Points in the camera frame."""
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
     for n in range(LANES):

@@ -60,8 +60,7 @@ class Layout:
         original: (n,) the observation of the problem that stands in each place of the order by points.
         image_offsets: (I + 1,) observations of each image; image_point, observed, precision their columns in this
             order, place (n,) where each stands in the order by points.
-        offsets: (P + 1,) observations of each point; image, obs_slot their columns in this order, source (n,) where
-            each stands in the order by images.
+        offsets: (P + 1,) observations of each point; image, obs_slot their columns in this order.
         image_frame: (I,) and frame_slot (F,): the frame of each image and its row, −1 where it does not move;
             slot_frame (S,) the inverse; image_slot (I,) the row of each image's frame.
         shared: the rows behind those of poses; shared row k is row S + k.
@@ -82,7 +81,6 @@ class Layout:
     offsets: np.ndarray
     image: np.ndarray
     obs_slot: np.ndarray
-    source: np.ndarray
     image_frame: np.ndarray
     frame_slot: np.ndarray
     slot_frame: np.ndarray
@@ -157,7 +155,8 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
     by_point, offsets = kernels.sort_rows(by_slot, problem.obs_points, points)
     image = problem.obs_images.take(by_point)
     point, slots = np.repeat(np.arange(points), np.diff(offsets)), image_slot.take(image)
-    place, source = _from_one_order_to_another(by_image, by_point, len(active))
+    position = np.empty(len(active), np.int32)
+    position[by_point] = np.arange(len(by_point), dtype=np.int32)
 
     shared = _shared_rows(problem, seen)
     image_shared = _rows_of_images(problem, shared, len(slot_frame))
@@ -173,11 +172,10 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         image_point=problem.obs_points.take(by_image),
         observed=problem.obs_points2D.take(by_image, axis=0),
         precision=np.ones(len(by_image)) if problem.obs_sigmas is None else 1 / problem.obs_sigmas[by_image],
-        place=place,
+        place=position.take(by_image),
         offsets=offsets,
         image=image,
         obs_slot=slots,
-        source=source,
         image_frame=image_frame,
         frame_slot=frame_slot,
         slot_frame=slot_frame,
@@ -195,16 +193,6 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         point_chunks=_even_ranges(offsets, chunks),
         image_chunks=_even_ranges(image_offsets, chunks),
     )
-
-
-def _from_one_order_to_another(first: np.ndarray, second: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the rows of one order (of some of `count` rows) stand in another, and the inverse."""
-    position = np.empty(count, np.int32)
-    position[second] = np.arange(len(second), dtype=np.int32)
-    place = position.take(first)
-    source = np.empty_like(place)
-    source[place] = np.arange(len(place), dtype=np.int32)
-    return place, source
 
 
 def _frames(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:

@@ -133,20 +133,12 @@ class BundleSystem:
         sums = self._images
         sums.clear()
         links.B.fill(0)
-        rotations, translations, centers = now.images
-        row_centers, limits = self._row_centers(), kernels.squared_limits(self._model_ids, now.params)
-
-        # Lambdas, since the checks of shapes in the test run would go over each annotated closure again.
-        cost = sum(self._run(lambda images: kernels.linearize_images(
-            *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
-            self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
-            rotations, translations, row_centers, now.params, now.points3D, self._loss, self._scale, self.lost_cost,
-            self._of_observations, sums.h, sums.F, sums.G, sums.f,
-        ), lay.image_chunks))  # fmt: skip
+        cost = self._over_images(now, now.points3D, self._loss, self.lost_cost, None)
         self._run(lambda points: kernels.gather_points(
             *points, lay.offsets, lay.obs_slot, lay.column_count, lay.column_place, lay.image, lay.obs_shared,
             links.starts, self.free_points, self._of_observations, self._V, self._g, links.N, links.B,
         ), lay.point_chunks)  # fmt: skip
+        rotations, _, centers = now.images
         prior, blocks, gradient = self._known.linearize(
             rotations, centers, now.frames.centers, now.params, now.biases
         )  # fmt: skip
@@ -160,7 +152,7 @@ class BundleSystem:
 
     def evaluate(self, loss: Loss) -> FloatArray:
         """ρ of the observations (n,) by points, at the current parameters; NaN where there is no projection."""
-        self._evaluate(self._state, loss_id(loss))
+        self._over_images(self._state, self._state.points3D, loss_id(loss), np.nan, self.costs)
         return self.costs
 
     def information(self) -> Information:
@@ -177,19 +169,22 @@ class BundleSystem:
         lay, now, then = self.layout, self._state, self._trial
         now.move(delta, lay.slot_frame, self._places, self._rigs, then)
         row_centers, totals = self._row_centers(), np.zeros((len(lay.point_chunks), 5))
-        rotations, translations, centers = then.images
 
+        # Lambdas, since the checks of shapes in the test run would go over each annotated closure again.
         self._run(lambda points: kernels.move_points(
             *points, *self._couplings, row_centers, now.points3D, self._M, self._g, delta, then.points3D
         ), lay.point_chunks)  # fmt: skip
-        self._evaluate(then, self._loss)
+        self._over_images(then, then.points3D, self._loss, np.nan, self.costs)
+        costs_here = self.costs
+        if np.isnan(self.costs).any():
+            costs_here = np.empty_like(self.costs)
+            self._over_images(then, now.points3D, self._loss, np.nan, costs_here)
         self._run(lambda job: kernels.settle_points(
-            *job[1], lay.offsets, lay.source, lay.image, lay.observed, lay.precision, self._image_cameras,
-            self._model_ids, rotations, translations, then.params, now.points3D, self._loss, self._scale,
-            self.lost_cost, damping, self._V, self._g, self.costs, then.points3D, totals[job[0]],
+            *job[1], lay.offsets, now.points3D, self.lost_cost, damping, self._V, self._g, self.costs,
+            costs_here, then.points3D, totals[job[0]],
         ), list(enumerate(lay.point_chunks)))  # fmt: skip
         cost, decrease, step, norm, lost = totals.sum(axis=0)
-        cost += self._known.cost(rotations, centers, then.params, then.biases, then.points3D)
+        cost += self._known.cost(then.images[0], then.images[2], then.params, then.biases, then.points3D)
         then.lost = int(lost)
         decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
         norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
@@ -199,14 +194,20 @@ class BundleSystem:
         """Makes the last trial current."""
         self._state, self._trial = self._trial, self._state
 
-    def _evaluate(self, state: _State, loss: int) -> None:
-        lay, limits = self.layout, kernels.squared_limits(self._model_ids, state.params)
+    def _over_images(
+        self, state: _State, points3D: FloatArray, loss: int, lost_cost: float, costs: FloatArray | None
+    ) -> float:
+        """The cost of a linearisation, or what each observation costs into `costs` (n,), by points."""
+        lay, sums, limits = self.layout, self._images, kernels.squared_limits(self._model_ids, state.params)
         rotations, translations, _ = state.images
-        self._run(lambda images: kernels.costs_of_images(
-            *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision,
-            self._image_cameras, self._model_ids, limits, rotations, translations, state.params,
-            state.points3D, loss, self._scale, self.costs,
-        ), lay.image_chunks)  # fmt: skip
+        row_centers = state.frames.centers.take(lay.slot_frame, axis=0)
+        return sum(self._run(lambda images: kernels.evaluate_images(
+            *images, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
+            self._image_cameras, self._model_ids, limits, lay.column_count, lay.columns,
+            rotations, translations, row_centers, state.params, points3D, loss, self._scale, lost_cost,
+            costs is None, self.costs if costs is None else costs, self._of_observations,
+            sums.h, sums.F, sums.G, sums.f,
+        ), lay.image_chunks))  # fmt: skip
 
     def _eliminate(self, damping: float) -> None:
         """Inverts the blocks of points and takes them out of the reduced system."""

@@ -124,29 +124,18 @@ def _kind(model_id, column):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _fill_perspective(kind, fx, fy, row, w):
     by_u, by_v = w[row * LANES : (row + 1) * LANES], w[(row + 1) * LANES : (row + 2) * LANES]
-    if kind in (_F, _FX, _FY):
-        along_x, along_y = (0.0 if kind == _FY else 1.0), (0.0 if kind == _FX else 1.0)
-        for n in range(LANES):
-            by_u[n] = w[_A_DISTORTED * LANES + n] * along_x
-            by_v[n] = w[_B_DISTORTED * LANES + n] * along_y
-    elif kind in (_CX, _CY):
-        along_x, along_y = (1.0 if kind == _CX else 0.0), (1.0 if kind == _CY else 0.0)
-        for n in range(LANES):
-            by_u[n] = along_x
-            by_v[n] = along_y
-    elif kind in (_P1, _P2):
-        first, second = (1.0, 0.0) if kind == _P1 else (0.0, 1.0)
-        for n in range(LANES):
-            a, b, s = w[_A * LANES + n], w[_B * LANES + n], w[_S * LANES + n]
-            product = 2.0 * a * b
-            by_u[n] = fx * (first * product + second * (s + 2.0 * a * a))
-            by_v[n] = fy * (second * product + first * (s + 2.0 * b * b))
-    else:
-        below = kind >= _DENOMINATOR
-        power = kind - (_DENOMINATOR if below else _K)
-        for n in range(LANES):
-            s = w[_S * LANES + n]
-            factor = s * w[_D * LANES + n] * (-w[_G * LANES + n] if below else 1.0)
-            factor *= (s if power > 0 else 1.0) * (s if power > 1 else 1.0)
-            by_u[n] = fx * factor * w[_A * LANES + n]
-            by_v[n] = fy * factor * w[_B * LANES + n]
+    # One loop for all kinds, where what is not meant is times zero, is compiled faster than a loop for each.
+    along_x, along_y = (1.0 if kind <= _FX else 0.0), (1.0 if kind <= _FY and kind != _FX else 0.0)
+    one_x, one_y = (1.0 if kind == _CX else 0.0), (1.0 if kind == _CY else 0.0)
+    first, second = (1.0 if kind == _P1 else 0.0), (1.0 if kind == _P2 else 0.0)
+    below, radial = kind >= _DENOMINATOR, (1.0 if kind >= _DENOMINATOR or _K <= kind < _P1 else 0.0)
+    power = kind - (_DENOMINATOR if below else _K)
+    for n in range(LANES):
+        a, b, s = w[_A * LANES + n], w[_B * LANES + n], w[_S * LANES + n]
+        product = 2.0 * a * b
+        factor = s * w[_D * LANES + n] * (-w[_G * LANES + n] if below else 1.0)
+        factor *= radial * (s if power > 0 else 1.0) * (s if power > 1 else 1.0)
+        bent_u = factor * a + first * product + second * (s + 2.0 * a * a)
+        bent_v = factor * b + second * product + first * (s + 2.0 * b * b)
+        by_u[n] = along_x * w[_A_DISTORTED * LANES + n] + one_x + fx * bent_u
+        by_v[n] = along_y * w[_B_DISTORTED * LANES + n] + one_y + fy * bent_v
