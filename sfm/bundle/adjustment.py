@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from sfm.bundle.gauge import held_by_two_cameras, put_back
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
+from sfm.bundle.reduced import SolverPlan
 from sfm.bundle.system import BundleSystem
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.events import SILENT, BundleAdjusted, Observer
+from sfm.core.events import SILENT, BundleAdjusted, BundlePlanned, Observer
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 from sfm.core.optim.losses import evaluate_loss
 
@@ -25,11 +28,11 @@ def adjust(
     problem: BundleProblem, config: BundleConfig = BundleConfig(), *, threads: int = 1, observer: Observer = SILENT,
     scope: str = "global",
 ) -> BundleResult:  # fmt: skip
-    """Minimises ½ Σ ρ(|projected − observed|² / σ²) over the free poses, points and camera parameters.
+    """Minimises ½ Σ ρ(|projected − observed|² / σ²), and what priors add, over the free poses, points and parameters.
 
     Observations without a projection at the start take no part. A point is never moved to where it loses a
     projection that it would keep where it is; an observation that loses its own all the same, because its camera
-    moved, is charged like the worst at the start (at least 100 px).
+    moved, is charged like the worst at the start (at least 100 px, or 100 standard deviations).
 
     The scene is free to turn, move and grow on the way, which takes fewer steps than to hold some of its poses; with
     the gauge `two_cameras` it is put back in the end, see `gauge`.
@@ -46,7 +49,7 @@ def adjust(
         system, _ = system_of(problem, wider, threads)
         _minimize(system, wider)
         problem = _moved(problem, system)
-    system, active = system_of(problem, free, threads)
+    system, active = system_of(problem, free, threads, announce=partial(_tell, observer, scope, problem))
     result = _result(problem, system, _minimize(system, free), active)
     if config.gauge == "two_cameras" and any(row.accepted for row in result.table[1:]):
         result = dataclasses.replace(result, problem=put_back(start, result.problem, system.layout))
@@ -65,10 +68,30 @@ def adjust(
     return result
 
 
-def system_of(problem: BundleProblem, config: BundleConfig, threads: int) -> tuple[BundleSystem, BoolArray]:
+def _tell(observer: Observer, scope: str, problem: BundleProblem, plan: SolverPlan, memory_bytes: int) -> None:
+    observer(
+        BundlePlanned(
+            scope=scope,
+            images=len(problem.image_cameras),
+            points=len(problem.points3D),
+            observations=len(problem.obs_images),
+            solver=plan.kind,
+            memory_bytes=memory_bytes,
+        )
+    )
+
+
+def _say_nothing(plan: SolverPlan, memory_bytes: int) -> None:
+    """Where nobody wants to know."""
+
+
+def system_of(
+    problem: BundleProblem, config: BundleConfig, threads: int,
+    announce: Callable[[SolverPlan, int], object] = _say_nothing,
+) -> tuple[BundleSystem, BoolArray]:  # fmt: skip
     """The normal equations of `problem`, and which observations (n,) take part."""
     active = _has_pose(problem)
-    system = _laid_out(problem, active, config, threads)
+    system = _laid_out(problem, active, config, threads, announce)
     valid = np.isfinite(system.evaluate("trivial"))
     if not valid.all():
         active[system.layout.original[~valid]] = False
@@ -85,12 +108,15 @@ def _has_pose(problem: BundleProblem) -> BoolArray:
     return np.isfinite(np.c_[poses.rotation.wxyz, poses.translation]).all(axis=1)[problem.obs_images]
 
 
-def _laid_out(problem: BundleProblem, active: BoolArray, config: BundleConfig, threads: int) -> BundleSystem:
+def _laid_out(
+    problem: BundleProblem, active: BoolArray, config: BundleConfig, threads: int,
+    announce: Callable[[SolverPlan, int], object] = _say_nothing,
+) -> BundleSystem:  # fmt: skip
     layout = lay_out(problem, active)
     held = np.zeros((len(layout.slot_frame), 6), bool)
     if config.gauge == "two_cameras":
         held = held_by_two_cameras(problem, layout)
-    return BundleSystem(problem, layout, held, config, threads)
+    return BundleSystem(problem, layout, held, config, threads, announce)
 
 
 def squared_errors(problem: BundleProblem) -> FloatArray:

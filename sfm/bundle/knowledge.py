@@ -202,7 +202,7 @@ class _ExpectedParams:
 def _measured(problem: BundleProblem) -> int:
     """Numbers that were measured of poses and points."""
     count = 0
-    for prior in problem.priors:
+    for prior in (*problem.pose_priors, *problem.point_priors):
         match prior:
             case GravityPrior():
                 count += 2 * len(prior.images)

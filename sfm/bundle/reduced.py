@@ -162,7 +162,7 @@ class ReducedSystem:
                 self._multiplied, side, self._solver.solve, model_tolerance=_MODEL_TOLERANCE,
                 residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
             )  # fmt: skip
-            delta = found.x if found.iterations else np.full(len(side), np.nan)
+            delta = found.x if found.iterations or not side.any() else np.full(len(side), np.nan)
         else:
             delta = self._solver.solve(side)
         return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
@@ -200,7 +200,9 @@ class ReducedSystem:
     def _marquardt_diagonal(self) -> FloatArray:
         """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
         raised, poses = np.empty_like(self._diagonal), len(self._layout.slot_frame)
-        for part in (slice(None, poses), slice(poses, None)):
+        cameras = poses + int(np.sum(self._layout.shared.camera >= 0))
+        sensors = cameras + int(np.sum(self._layout.shared.sensor >= 0))
+        for part in (slice(None, poses), slice(poses, cameras), slice(cameras, sensors), slice(sensors, None)):
             largest = self._diagonal[part].max(axis=0, initial=0.0)
             np.maximum(self._diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
         return raised

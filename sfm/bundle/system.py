@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,7 @@ class BundleSystem:
 
     Args:
         held: (S, 6) entries of the poses' tangents that stay zero, for the gauge.
+        announce: told the solver and about how many bytes will be taken, before they are.
 
     Attributes:
         lost_cost: what an observation costs that has no projection.
@@ -50,8 +52,9 @@ class BundleSystem:
     """
 
     def __init__(
-        self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, threads: int
-    ) -> None:
+        self, problem: BundleProblem, layout: Layout, held: BoolArray, config: BundleConfig, threads: int,
+        announce: Callable[[SolverPlan, int], object] = lambda plan, memory_bytes: None,
+    ) -> None:  # fmt: skip
         self.layout, self._rigs = layout, problem.rigs
         workers = Workers(threads)
         self._run = workers.map
@@ -64,6 +67,9 @@ class BundleSystem:
         images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
         self.held = layout.padding
         self.held[: len(held)] |= held
+        self._known = Knowledge(problem, layout)
+        plan = plan_solver(layout, self.held, self._known.targets, config.solver)
+        announce(plan, _forecast_bytes(layout, plan, images, points))
         self._images = ImageSums.allocate(images, widest)
         self._of_observations = np.empty((len(layout.image), 9 + 3 * widest))
         self.costs = np.empty(len(layout.image))
@@ -72,8 +78,6 @@ class BundleSystem:
             layout.starts, layout.slot, np.empty((len(layout.slot), 6)),
             layout.shared_starts, layout.shared_slot, np.empty((len(layout.shared_slot), 3, BLOCK)),
         )  # fmt: skip
-        self._known = Knowledge(problem, layout)
-        plan = plan_solver(layout, self.held, self._known.targets, config.solver)
         self._reduced = ReducedSystem(layout, self.held, self._couplings, self._known.targets, plan, workers)
 
     @property
@@ -216,6 +220,15 @@ class BundleSystem:
 
     def _row_centers(self) -> FloatArray:
         return self._state.frames.centers.take(self.layout.slot_frame, axis=0)
+
+
+def _forecast_bytes(layout: Layout, plan: SolverPlan, images: int, points: int) -> int:
+    """About the memory of an adjustment: its layout, the solver, and the arrays that kernels fill."""
+    columns, shared = layout.columns.shape[1], layout.image_shared.shape[1]
+    observation = 44 + 4 * shared + 8 * (9 + 3 * columns) + 8
+    couplings = 52 * len(layout.slot) + 148 * len(layout.shared_slot)
+    image = 8 * (6 + 6 * columns + columns**2 + columns) + 8 * 32
+    return plan.bytes + observation * len(layout.image) + couplings + image * images + 8 * 29 * points
 
 
 class Information(NamedTuple):

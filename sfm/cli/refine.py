@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +16,7 @@ from sfm.core.errors import ConfigError, ExitCode, InputError
 
 if TYPE_CHECKING:
     from sfm.bundle.reconstruction import Intrinsics
+    from sfm.core.events import Event
     from sfm.pipeline.priors import Measurements, PriorConfig
     from sfm.pipeline.refinement import MeasuredFrame, RefinedModel
 
@@ -131,6 +133,9 @@ class RefineOptions:
     threads: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all cores)")] = 0
     """At most so many at once. The result does not depend on it."""
 
+    plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE.svg", help_behavior_hint="")] = None
+    """Draw cost, gradient and damping of each iteration."""
+
     text: Flag = False
     """Write COLMAP text."""
 
@@ -155,6 +160,7 @@ def main(words: Sequence[str]) -> int:
     from sfm.io.atomic import write_text
     from sfm.io.colmap_model import model_format, read_model, write_model
     from sfm.pipeline.refinement import RefinementConfig, refine_model
+    from sfm.viz.convergence import convergence_svg
 
     if options.loss not in LOSSES:
         raise ConfigError(f"unknown loss {options.loss!r}", remedy=f"choose one of {', '.join(LOSSES)}")
@@ -189,14 +195,29 @@ def main(words: Sequence[str]) -> int:
     threads, model = options.threads or available_threads(), read_model(source)
     measured = _measurements(options, model.image_names)
     try:
-        refined = refine_model(model, config, measured=measured, with_covariance=options.sigmas, threads=threads)
+        refined = refine_model(
+            model, config, measured=measured, with_covariance=options.sigmas, threads=threads, observer=_announce
+        )
     except InputError as error:
         raise InputError(error.cause, path=source, remedy=error.remedy) from error
     write_model(refined.reconstruction, options.output, text=options.text)
     if refined.frame is not None:
         write_text(options.output / "frame.json", json.dumps(refined.frame.to_json(), indent=2) + "\n")
+    if options.plot is not None:
+        write_text(options.plot, convergence_svg(refined.result.table, f"sfm refine {options.model}"))
     print(json.dumps(refined.to_json(), indent=2) if options.json else summary(refined, options.output))
     return ExitCode.OK
+
+
+def _announce(event: Event) -> None:
+    """Tells what an adjustment will take before it takes it."""
+    from sfm.core.events import BundlePlanned
+
+    if isinstance(event, BundlePlanned):
+        sys.stderr.write(
+            f"adjusting {event.images} images, {event.points} points, {event.observations} observations: "
+            f"{event.solver} solver, about {max(event.memory_bytes >> 20, 1)} MB\n"
+        )
 
 
 def _prior_config(options: RefineOptions) -> PriorConfig:

@@ -97,6 +97,18 @@ class ImageRegistered(Event):
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class BundlePlanned(Event):
+    """An adjustment is about to take its memory; `solver` is dense, sparse or iterative."""
+
+    scope: str
+    images: int
+    points: int
+    observations: int
+    solver: str
+    memory_bytes: int
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class BundleAdjusted(Event):
     """An adjustment ended."""
 

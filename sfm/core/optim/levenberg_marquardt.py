@@ -120,9 +120,9 @@ def minimize(system: System, rules: StopRules) -> Summary:
     for _ in range(rules.max_iterations):
         used, trial = damping, system.try_step(damping)
         gain, change, accepted = _gain(cost, trial)
-        if accepted:
+        if accepted and trial is not None:
             system.accept()
-            cost -= change
+            cost = trial.cost
         reason = _stop(rules, cost, change, used, trial)
         if accepted and reason is None:
             cost, gradient = system.linearize()
