@@ -151,7 +151,9 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
     image_slot = frame_slot[image_frame]
     by_slot = by_image
     if np.any(image_slot[1:] < image_slot[:-1]):
-        by_slot, _ = kernels.sort_rows(by_image, image_slot[problem.obs_images] + 1, len(slot_frame) + 1)
+        keys = image_slot.take(problem.obs_images) + 1
+        keys.flags.writeable = False  # as the columns of the problem are: so the kernel is compiled once
+        by_slot, _ = kernels.sort_rows(by_image, keys, len(slot_frame) + 1)
     by_point, offsets = kernels.sort_rows(by_slot, problem.obs_points, points)
     image = problem.obs_images.take(by_point)
     point, slots = np.repeat(np.arange(points), np.diff(offsets)), image_slot.take(image)

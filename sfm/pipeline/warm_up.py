@@ -26,6 +26,10 @@ from sfm.core.errors import Rejected
 from sfm.core.events import Note, Observer
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
+from sfm.core.optim._block_kernels import WIDTH
+from sfm.core.optim._cholesky_kernels import PANEL
+from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.dense_cholesky import DenseCholesky
 from sfm.core.robust import estimate_fundamental
 from sfm.core.scene import Features, Matches, PairKind, Reconstruction, TwoViewGeometry, ViewGraph
 from sfm.features import extract_features
@@ -37,6 +41,7 @@ from sfm.retrieval import RetrievalConfig, similar_images
 from sfm.verification import verify_pair
 
 _IMAGES, _POINTS, _STRAYS = 6, 240, 24
+_ROWS = 2 * PANEL
 _COMPILE = "import sys; from sfm.pipeline.warm_up import run_parts; run_parts(sys.argv[1:])"
 
 
@@ -141,12 +146,20 @@ def _models() -> list[Reconstruction]:
             for i, j in itertools.combinations(keypoints, 2)
         }
     )
+    _factor()
     owners, names = dict.fromkeys(keypoints, 1), {k: str(k) for k in keypoints}
     models = map_incrementally(graph, keypoints, {1: _camera(False)}, owners, names)
     with tempfile.TemporaryDirectory() as folder:
         for model in models:
             write_model(model, Path(folder))
     return models
+
+
+def _factor() -> None:
+    """A dense factor of more unknowns than the made-up scene has, of several panels."""
+    pattern = BlockPattern.full(_ROWS)
+    blocks, unknowns = np.zeros((len(pattern.columns), BLOCK, WIDTH)), BLOCK * _ROWS
+    DenseCholesky(pattern, np.zeros(unknowns, bool)).factor(blocks[:, :, :BLOCK], np.ones(unknowns))
 
 
 _PARTS = {"pair": _pair, "models": _models, "features": _features}
