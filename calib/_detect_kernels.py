@@ -113,7 +113,7 @@ def _solve(low, vector, out):
 
 @njit(cache=True, nogil=True)
 def _gather(image, x, y, window, xs, ys, grey):
-    """The pixels whose centres d = (px, py) − (x, y) satisfy |window d| ≤ 1; their number, or −1 if they are cut off."""
+    """The pixels whose centres d = (px, py) − (x, y) have |window d| ≤ 1; their number, −1 if they are cut off."""
     height, width = image.shape
     det = window[0, 0] * window[1, 1] - window[0, 1] * window[1, 0]
     half_x = math.sqrt(window[0, 1] ** 2 + window[1, 1] ** 2) / abs(det)
@@ -219,7 +219,7 @@ def fit_crossings(image, points, windows, angles, capacity, out, covariances, fi
                 break
         if cost >= 0.0 and _covariance(xs, ys, grey, count, p, covariances[i]):
             out[i, 0], out[i, 1] = p[0], p[1]
-            fitted[i, 0], fitted[i, 1], fitted[i, 2], fitted[i, 3] = p[4], abs(p[6]), math.sqrt(cost / count), count
+            fitted[i, 0], fitted[i, 1], fitted[i, 2], fitted[i, 3] = p[4], p[6], math.sqrt(cost / count), count
 
 
 @njit(cache=True, nogil=True)

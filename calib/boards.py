@@ -81,16 +81,27 @@ class Board(Value):
 
     @property
     def clear_radius_m(self) -> float:
-        """Around a corner nothing else is printed but its own two edges, or its own circle, up to this distance."""
+        """Around a corner nothing else is printed but its own two edges, or its own circle, up to this distance.
+
+        For a chessboard it is half of that, so that the pixels of a corner are no other's.
+        """
         match self.kind:
             case "chessboard":
-                return self.pitch_m
+                return self.pitch_m / 2
             case "charuco":
                 return (self.pitch_m - self.detail_m) / np.sqrt(2)
             case "aprilgrid":
                 return min(self.detail_m, np.sqrt(2) * _TAG_BORDER * self.pitch_m)
         nearest = self.pitch_m * (np.sqrt(2) if self.kind == "acircles" else 1)
         return nearest - self.detail_m / 2
+
+    @property
+    def diagonal_is_black(self) -> np.ndarray:
+        """Of each corner, whether the two quadrants in which x y > 0 are black, rather than the other two."""
+        numbers = np.arange(len(self.points3D))
+        if self.kind == "aprilgrid":
+            return numbers % 2 == 0
+        return (numbers % self.grid[0] + numbers // self.grid[0]) % 2 == 0
 
     @property
     def spec(self) -> str:

@@ -91,7 +91,8 @@ def parse_board(text: str) -> Board:
         raise ConfigError(f"{text!r}: expected {what.replace('_m', '').replace('_', ' ')}", remedy=_EXAMPLE)
     if len(names) > (kind in ("charuco", "aprilgrid")):
         raise ConfigError(f"{text!r}: {names[-1]!r} has no meaning there", remedy=_EXAMPLE)
-    return make_board(kind, int(size[1]), int(size[2]), *(lengths + [0.0])[:2], *names)
+    pitch, detail = (lengths + [0.0])[:2]
+    return make_board(kind, int(size[1]), int(size[2]), pitch, detail, names[0] if names else "")
 
 
 def board_toml(board: Board) -> str:
