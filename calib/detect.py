@@ -25,6 +25,9 @@ from sfm.core.arrays import Mask, Points2D, Value, readonly
 from sfm.core.errors import Rejected
 from sfm.core.imaging.noise import noise_sigma
 
+_FLAT_PX = 0.5
+"""Corners that are as near to each other as this are no board."""
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class DetectConfig:
@@ -65,7 +68,8 @@ class Detection(Value):
         points2D: px; the centre of the first pixel is (0.5, 0.5).
         covariances: px², from the residuals of each corner's pixels. What all corners of a neighbourhood have in
             common (bent paper, distortion within the window) is not in it.
-        rejected: the reason for each corner that was found but did not stay.
+        rejected: the reason for each corner that was found but did not stay, by its id, ascending.
+        rejected2D: where these were sought.
         finder: which finder saw the board.
         blur_px: median standard deviation of the blur of the edges; NaN for circles.
     """
@@ -77,6 +81,7 @@ class Detection(Value):
     points2D: Points2D
     covariances: Float64[np.ndarray, "N 2 2"]
     rejected: Mapping[int, str] = dataclasses.field(default_factory=dict)
+    rejected2D: Float64[np.ndarray, "R 2"] = dataclasses.field(default_factory=lambda: np.empty((0, 2)))
     finder: str = ""
     blur_px: float = float("nan")
 
@@ -85,7 +90,8 @@ class Detection(Value):
         object.__setattr__(self, "corner_ids", readonly(self.corner_ids, (count,), np.int64))
         object.__setattr__(self, "points2D", readonly(self.points2D, (count, 2)))
         object.__setattr__(self, "covariances", readonly(self.covariances, (count, 2, 2)))
-        object.__setattr__(self, "rejected", MappingProxyType(dict(self.rejected)))
+        object.__setattr__(self, "rejected", MappingProxyType(dict(sorted(self.rejected.items()))))
+        object.__setattr__(self, "rejected2D", readonly(self.rejected2D, (len(self.rejected), 2)))
 
 
 @dataclasses.dataclass(slots=True)
@@ -93,6 +99,7 @@ class _Corners:
     """Corners under judgement, in order of their ids; those that fell stay, with a reason."""
 
     ids: Int64[np.ndarray, " N"]
+    sought: Points2D
     points2D: Points2D
     covariances: Float64[np.ndarray, "N 2 2"]
     contrast: Float64[np.ndarray, " N"]
@@ -144,6 +151,7 @@ def detect_board(
         best.points2D[kept],
         best.covariances[kept],
         best.reasons,
+        best.sought[~kept],
         best_finder,
         float(np.median(blur)) if np.isfinite(blur).any() else float("nan"),
     )
@@ -160,8 +168,10 @@ def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig)
         affines = local_affines(_on_board(board, ids), points2D)
     except ValueError:
         return None
+    if np.linalg.svd(affines, compute_uv=False)[:, 1].min() * board.clear_radius_m < _FLAT_PX:
+        return None
     if board.has_circles:
-        return _fitted_circles(grey, board, ids, points2D, affines)
+        return _fitted_circles(grey, board, ids, points2D, affines, config)
     if board.kind == "chessboard":
         ids, points2D = _as_printed(grey, board, points2D, affines, config)
         affines = local_affines(_on_board(board, ids), points2D)
@@ -184,19 +194,15 @@ def _as_printed(
     of rows is odd and that of columns even or the other way round; otherwise the board itself has no first corner.
     """
     columns, rows = board.grid
-    ids = np.arange(len(points2D)).reshape(rows, columns)
+    ids = np.arange(len(points2D))
     if np.median(np.linalg.det(affines)) < 0:
-        ids = ids[:, ::-1]
-        affines = affines * [1, -1][::-1]
-    ids = ids.reshape(-1)
-    points2D = points2D[ids]
+        points2D = points2D[ids.reshape(rows, columns)[:, ::-1].reshape(-1)]
+        affines = local_affines(_on_board(board, ids), points2D)
     if (columns + rows) % 2:
-        # Mirrored or not, the fit knows colours only by the frame that the affines give it.
-        affines = local_affines(_on_board(board, np.arange(len(ids))), points2D)
         fitted = fit_crossings(grey, points2D, affines, config.window * board.clear_radius_m, config.max_window_px)
         if np.nansum(np.where(board.diagonal_is_black, 1, -1) * np.sign(fitted.contrast)) < 0:
-            points2D = points2D[::-1]
-    return np.arange(len(points2D)), points2D.copy()
+            points2D = points2D[::-1].copy()
+    return ids, points2D
 
 
 def _fitted_crossings(
@@ -204,7 +210,9 @@ def _fitted_crossings(
 ) -> _Corners:
     """Corners near `points2D`, with a verdict on each."""
     fitted = fit_crossings(grey, points2D, affines, config.window * board.clear_radius_m, config.max_window_px)
-    corners = _Corners(ids, fitted.points2D, fitted.covariances, fitted.contrast, fitted.misfit, fitted.blur_px)
+    corners = _Corners(
+        ids, points2D, fitted.points2D, fitted.covariances, fitted.contrast, fitted.misfit, fitted.blur_px
+    )
     corners.reject(np.isnan(fitted.misfit), "cut off, or no crossing")
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * 2 * board.clear_radius_m
     jumped = np.linalg.norm(fitted.points2D - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0)
@@ -229,7 +237,8 @@ def _judge_places(board: Board, corners: _Corners, config: DetectConfig) -> None
     """Rejects the corner that its neighbours disagree with most, until none stands out."""
     while (kept := corners.kept).sum() > 4:
         known, points2D = _on_board(board, corners.ids[kept]), corners.points2D[kept]
-        off = np.linalg.norm(predicted(known, known, points2D) - points2D, axis=1)
+        wanted, gain = predicted(known, known, points2D)
+        off = np.linalg.norm(wanted - points2D, axis=1) / gain
         scale = np.median(np.linalg.svd(local_affines(known, points2D), compute_uv=False)) * 2 * board.clear_radius_m
         limit = max(config.max_bend * float(np.median(off)), 0.05 * scale, 0.5)
         if off.max() <= limit:
@@ -254,7 +263,7 @@ def _completed(grey: np.ndarray, board: Board, corners: _Corners, config: Detect
             local_affines(known, points2D)
         except ValueError:
             return corners
-        expected = predicted(_on_board(board, absent), known, points2D)
+        expected, _ = predicted(_on_board(board, absent), known, points2D)
         inside = ((expected > 0) & (expected < [grey.shape[1], grey.shape[0]])).all(axis=1)
         ids = np.concatenate([corners.ids[kept], absent[inside]])
         order = np.argsort(ids)
@@ -267,23 +276,30 @@ def _completed(grey: np.ndarray, board: Board, corners: _Corners, config: Detect
         is_old = np.isin(tried.ids, corners.ids)
         told = {number: reason for number, reason in tried.reasons.items() if number in set(tried.ids[is_old].tolist())}
         stays = tried.kept | is_old
-        fields = (tried.ids, tried.points2D, tried.covariances, tried.contrast, tried.misfit, tried.blur_px)
+        fields = (
+            tried.ids,
+            tried.sought,
+            tried.points2D,
+            tried.covariances,
+            tried.contrast,
+            tried.misfit,
+            tried.blur_px,
+        )
         corners = _Corners(*(values[stays] for values in fields), reasons=told)
     return corners
 
 
-def _fitted_circles(grey: np.ndarray, board: Board, ids: np.ndarray, points2D: Points2D, affines: Affines) -> _Corners:
+def _fitted_circles(
+    grey: np.ndarray, board: Board, ids: np.ndarray, points2D: Points2D, affines: Affines, config: DetectConfig
+) -> _Corners:
     """Centres of circles near `points2D`, with a verdict on each."""
-    config = DetectConfig()
     noise = 255 * noise_sigma(np.ascontiguousarray(grey))
     centroids, covariances = fit_circles(grey, points2D, affines, board, noise)
     nothing = np.full(len(ids), np.nan)
-    corners = _Corners(ids, centroids, covariances, nothing, nothing, nothing)
+    corners = _Corners(ids, points2D, centroids, covariances, nothing, nothing, nothing)
     corners.reject(np.isnan(centroids[:, 0]), "cut off, or no circle")
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * board.pitch_m
-    corners.reject(
-        np.linalg.norm(centroids - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0), "jumped"
-    )
+    corners.reject(np.linalg.norm(centroids - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0), "jumped")
     _judge_places(board, corners, config)
     kept = corners.kept
     if kept.sum() >= 4:

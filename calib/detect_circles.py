@@ -25,6 +25,8 @@ _DARK, _LIGHT = 0.25, 0.75
 """Between these parts of the contrast darkness is counted in proportion; beyond, noise has no say."""
 _ROUNDING_VARIANCE = 1 / 12
 _LEAST_CONTRAST = 12.0
+_MARGIN = 0.2
+"""Of the blank up to the next circle, the part that belongs to the window; more may reach beyond the board's edge."""
 
 
 def fit_circles(
@@ -36,7 +38,7 @@ def fit_circles(
         affines: of the map from board to image at the circles.
         noise: standard deviation of the grey values, which reach from 0 to 255.
     """
-    radius = board.detail_m / 2 + 0.4 * (board.clear_radius_m - board.detail_m / 2)
+    radius = board.detail_m / 2 + _MARGIN * (board.clear_radius_m - board.detail_m / 2)
     centres, covariances = np.full_like(points2D, np.nan), np.full((len(points2D), 2, 2), np.nan)
     for i, (point, affine) in enumerate(zip(points2D, affines, strict=True)):
         fitted = _centroid(grey, point, affine * radius, noise)

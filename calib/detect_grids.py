@@ -141,7 +141,7 @@ def _circles(grey: Grey, board: Board) -> Iterator[Found]:
     layout = cv2.CALIB_CB_ASYMMETRIC_GRID if board.kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
     for image in _sizes(grey):
         for clustering in (0, cv2.CALIB_CB_CLUSTERING):
-            for blobs in (_blob_detector(image), cv2.SimpleBlobDetector_create()):
+            for blobs in (_blob_detector(image), cv2.SimpleBlobDetector.create()):
                 found, centres = cv2.findCirclesGrid(image, board.grid, flags=layout | clustering, blobDetector=blobs)
                 if found:
                     yield _complete("clusters" if clustering else "blobs", centres, image, grey)
@@ -149,9 +149,9 @@ def _circles(grey: Grey, board: Board) -> Iterator[Found]:
 
 def _blob_detector(image: Grey) -> cv2.SimpleBlobDetector:
     """Dark blobs of any size and slant; OpenCV's defaults refuse those over 5000 px²."""
-    parameters = cv2.SimpleBlobDetector_Params()
+    parameters = cv2.SimpleBlobDetector.Params()
     parameters.minArea, parameters.maxArea = 12.0, image.size / 8
     parameters.minDistBetweenBlobs = 3.0
     parameters.filterByInertia = False
     parameters.minConvexity = 0.8
-    return cv2.SimpleBlobDetector_create(parameters)
+    return cv2.SimpleBlobDetector.create(parameters)

@@ -36,7 +36,9 @@ def local_affines(board_points: Points2D, points2D: Points2D) -> Affines:
     return affines
 
 
-def predicted(targets: Points2D, board_points: Points2D, points2D: Points2D) -> Points2D:
+def predicted(
+    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"]
+) -> tuple[Points2D, Float64[np.ndarray, " N"]]:
     """Where corners must be in the image if board and lens are smooth, each from its nearest neighbours but itself.
 
     A quadratic function of the position on the board, an affine one where there are few neighbours.
@@ -44,6 +46,9 @@ def predicted(targets: Points2D, board_points: Points2D, points2D: Points2D) -> 
     Args:
         targets: (x, y) on the board of the corners asked for.
         board_points: of those that are known.
+    Returns:
+        Their pixels; and by how much the errors of the neighbours are amplified: the deviation of a predicted
+        from a measured place, where all errors are 1. At the border of a board it is several times that within.
     """
     offset = board_points[None] - targets[:, None]
     distance = np.linalg.norm(offset, axis=2)
@@ -58,7 +63,7 @@ def predicted(targets: Points2D, board_points: Points2D, points2D: Points2D) -> 
     design = np.stack(terms, axis=2)
     # Where neighbours are on a line, the pseudo-inverse takes the flattest function through them.
     weights = np.linalg.pinv(design, rcond=1e-4)[:, 0]
-    return np.einsum("nk,nkd->nd", weights, points2D[order])
+    return np.einsum("nk,nkd->nd", weights, points2D[order]), np.sqrt(1 + np.square(weights).sum(axis=1))
 
 
 def _distances(board_points: Points2D) -> tuple[np.ndarray, np.ndarray]:
@@ -66,7 +71,9 @@ def _distances(board_points: Points2D) -> tuple[np.ndarray, np.ndarray]:
     return between, np.linalg.norm(between, axis=2)
 
 
-def _fitted_affines(between: np.ndarray, points2D: Points2D, near: np.ndarray) -> tuple[Affines, Bool[np.ndarray, " N"]]:
+def _fitted_affines(
+    between: np.ndarray, points2D: Points2D, near: np.ndarray
+) -> tuple[Affines, Bool[np.ndarray, " N"]]:
     """Least squares over the neighbours, and whether they determine it."""
     moved = points2D[None] - points2D[:, None]
     spread = np.einsum("ij,ijk,ijl->ikl", near, between, between)
