@@ -25,6 +25,10 @@ from sfm.core.arrays import Mask, Points2D, Value, readonly
 from sfm.core.errors import Rejected
 from sfm.core.imaging.noise import noise_sigma
 
+_ROUNDS_OF_COMPLETION = 8
+_LARGEST_GAIN = 3.0
+"""Corners that are sought without a marker are within or next to those that are known: errors of the neighbours are
+amplified by no more than this. Farther out, something else would be found and agree with itself."""
 _FLAT_PX = 0.5
 """Corners that are as near to each other as this are no board."""
 
@@ -253,7 +257,7 @@ def _completed(grey: np.ndarray, board: Board, corners: _Corners, config: Detect
 
     What is not there after all fails the same gates; only corners that pass are added.
     """
-    for _ in range(2):
+    for _ in range(_ROUNDS_OF_COMPLETION):
         kept = corners.kept
         absent = np.setdiff1d(np.arange(len(board.points3D)), corners.ids[kept])
         if kept.sum() < config.min_corners or not len(absent):
@@ -263,8 +267,8 @@ def _completed(grey: np.ndarray, board: Board, corners: _Corners, config: Detect
             local_affines(known, points2D)
         except ValueError:
             return corners
-        expected, _ = predicted(_on_board(board, absent), known, points2D)
-        inside = ((expected > 0) & (expected < [grey.shape[1], grey.shape[0]])).all(axis=1)
+        expected, gain = predicted(_on_board(board, absent), known, points2D)
+        inside = (gain < _LARGEST_GAIN) & ((expected > 0) & (expected < [grey.shape[1], grey.shape[0]])).all(axis=1)
         ids = np.concatenate([corners.ids[kept], absent[inside]])
         order = np.argsort(ids)
         sought = np.concatenate([points2D, expected[inside]])[order]

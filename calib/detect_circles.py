@@ -25,6 +25,8 @@ _DARK, _LIGHT = 0.25, 0.75
 """Between these parts of the contrast darkness is counted in proportion; beyond, noise has no say."""
 _ROUNDING_VARIANCE = 1 / 12
 _LEAST_CONTRAST = 12.0
+_SAMPLING_PX = 0.007
+"""Deviation that remains without noise, since pixels sample the rim coarsely: measured with a blur of 0.5 px."""
 _MARGIN = 0.2
 """Of the blank up to the next circle, the part that belongs to the window; more may reach beyond the board's edge."""
 
@@ -100,4 +102,4 @@ def _centroid(
         if np.abs(step).max() < 1e-4:
             break
     spread = (offset * slope[:, None]) / weight.sum()
-    return centre, (noise**2 + _ROUNDING_VARIANCE) * spread.T @ spread
+    return centre, (noise**2 + _ROUNDING_VARIANCE) * spread.T @ spread + _SAMPLING_PX**2 * np.eye(2)
