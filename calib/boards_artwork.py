@@ -37,7 +37,7 @@ class Artwork(Value):
     width_m: float
     height_m: float
     black: Rectangles
-    white: Rectangles
+    white: Float64[np.ndarray, "W 4"]
     circles: Circles
     corners: Points2D
 
@@ -94,7 +94,7 @@ def marker_cells(dictionary: str, marker: int, border: int) -> Bool[np.ndarray, 
     return markers.generateImageMarker(marker, markers.markerSize + 2 * border, borderBits=border) > 127
 
 
-def _chessboard(board: Board, columns: int, rows: int, white: Rectangles) -> Artwork:
+def _chessboard(board: Board, columns: int, rows: int, white: Float64[np.ndarray, "W 4"]) -> Artwork:
     side, margin = board.pitch_m, _QUIET * board.pitch_m
     black = [
         (margin + column * side, margin + row * side, side, side)

@@ -71,12 +71,12 @@ def _sizes(grey: Grey) -> Iterator[Grey]:
         yield resize(grey, 2 * width, 2 * height)
 
 
-def _complete(name: str, corners: np.ndarray, image: Grey, grey: Grey) -> Found:
+def _complete(name: str, corners: np.ndarray, image: np.ndarray, grey: np.ndarray) -> Found:
     points = _in_pixels(corners, image, grey)
     return name, np.arange(len(points)), points
 
 
-def _in_pixels(corners: np.ndarray, image: Grey, grey: Grey) -> Points2D:
+def _in_pixels(corners: np.ndarray, image: np.ndarray, grey: np.ndarray) -> Points2D:
     """From OpenCV's coordinates in a resized image to pixels of the photo."""
     ratio = np.array([grey.shape[1] / image.shape[1], grey.shape[0] / image.shape[0]])
     return (np.asarray(corners, np.float64).reshape(-1, 2) + _OPENCV_HALF) * ratio
