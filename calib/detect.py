@@ -29,6 +29,8 @@ _ROUNDS_OF_COMPLETION = 8
 _LARGEST_GAIN = 3.0
 """Corners that are sought without a marker are within or next to those that are known: errors of the neighbours are
 amplified by no more than this. Farther out, something else would be found and agree with itself."""
+_LEAST_BEND = 0.08
+"""Of the distance of neighbours; at the edge of a fisheye image the best quadratic function is off by 0.06."""
 _FLAT_PX = 0.5
 """Corners that are as near to each other as this are no board."""
 
@@ -244,7 +246,7 @@ def _judge_places(board: Board, corners: _Corners, config: DetectConfig) -> None
         wanted, gain = predicted(known, known, points2D)
         off = np.linalg.norm(wanted - points2D, axis=1) / gain
         scale = np.median(np.linalg.svd(local_affines(known, points2D), compute_uv=False)) * 2 * board.clear_radius_m
-        limit = max(config.max_bend * float(np.median(off)), 0.05 * scale, 0.5)
+        limit = max(config.max_bend * float(np.median(off)), _LEAST_BEND * scale, 0.5)
         if off.max() <= limit:
             return
         worst = np.zeros(len(kept), bool)

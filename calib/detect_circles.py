@@ -27,6 +27,7 @@ _ROUNDING_VARIANCE = 1 / 12
 _LEAST_CONTRAST = 12.0
 _SAMPLING_PX = 0.007
 """Deviation that remains without noise, since pixels sample the rim coarsely: measured with a blur of 0.5 px."""
+_NEIGHBOURS = 12
 _MARGIN = 0.2
 """Of the blank up to the next circle, the part that belongs to the window; more may reach beyond the board's edge."""
 
@@ -60,18 +61,44 @@ def centre_shifts(board_points: Points2D, radius_m: float, image_from_board: Mat
 
 
 def without_shifts(points2D: Points2D, board_points: Points2D, radius_m: float) -> Points2D:
-    """Images of the circles' centres from centroids of ellipses.
+    """Images of the circles' centres from centroids of their images.
 
-    The homography that fits all circles is near enough: of a shift that is itself some tenths of a pixel, what
-    distortion changes is a few per cent.
+    Perspective is taken off by the homography that fits all circles; what the lens bends beyond it, by the difference
+    of the second-order shifts of what is seen and of the homography's own picture of it.
     """
     centres = points2D
     for _ in range(2):
         homography, _ = cv2.findHomography(board_points, centres)
         if homography is None:
             return points2D
-        centres = points2D - centre_shifts(board_points, radius_m, homography)
+        flat = np.column_stack([board_points, np.ones(len(board_points))]) @ homography.T
+        bent = curvature_shifts(board_points, centres, radius_m)
+        bent -= curvature_shifts(board_points, flat[:, :2] / flat[:, 2:], radius_m)
+        centres = points2D - centre_shifts(board_points, radius_m, homography) - bent
     return centres
+
+
+def curvature_shifts(board_points: Points2D, points2D: Points2D, radius_m: float) -> Points2D:
+    """Centroid of the image of each disc less the image of its centre, to second order in the radius, for any lens.
+
+    With f the map from board to image and J its Jacobian, the centroid is  f + r²/8 ∇²f + r²/4 J ∇ log det J; the
+    derivatives are those of a quadratic function through the nearest neighbours. Zero where there are few.
+    """
+    if len(board_points) < _NEIGHBOURS:
+        return np.zeros_like(points2D)
+    offset = board_points[None] - board_points[:, None]
+    order = np.argsort(np.linalg.norm(offset, axis=2), axis=1, kind="stable")[:, :_NEIGHBOURS]
+    x, y = np.moveaxis(np.take_along_axis(offset, order[:, :, None], 1) / radius_m, 2, 0)
+    design = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=2)
+    _, fx, fy, fxx, fxy, fyy = np.moveaxis(np.linalg.pinv(design, rcond=1e-4) @ points2D[order], 1, 0)
+    determinant = _cross(fx, fy)
+    along_x = (_cross(fxx, fy) + _cross(fx, fxy)) / determinant
+    along_y = (_cross(fxy, fy) + _cross(fx, fyy)) / determinant
+    return (fxx + fyy) / 8 + (fx * along_x[:, None] + fy * along_y[:, None]) / 4
+
+
+def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
 
 
 def _centroid(
