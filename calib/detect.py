@@ -41,10 +41,10 @@ class DetectConfig:
 
     window: float = 0.8
     """Semi-axis of the window by `Board.clear_radius_m`: 1 would touch the next print. For a chessboard it is 0.4
-    squares; RMS of a calibration changes by 1 % between 0.3 and 0.45."""
+    squares; RMS of a calibration changes by 2 % between 0.3 and 0.45."""
 
     max_window_px: float = 12.0
-    """Longest semi-axis of the window. Of 8, 12 and no limit 12 is best or within 1 % of it on five sets of photos."""
+    """Longest semi-axis of the window. Of 8, 12 and no limit 12 is best or within 2 % of it on four sets of photos."""
 
     max_jump: float = 0.25
     """A corner that moves by more of the distance to its neighbours when it is made precise was none."""

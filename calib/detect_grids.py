@@ -1,7 +1,7 @@
 """Where a board is, roughly: OpenCV's finders, tried one after the other.
 
-No finder of chessboards is best everywhere: on 138 photos of nine sets the older one misses 11 boards, the newer one
-9 to 12 depending on its options, and all together two, both of which are cut by the border. Positions are good to a
+No finder of chessboards is best everywhere: on 141 photos of nine sets the older one misses 11 boards, the newer one
+6 to 11 depending on its options, and all together two, both of which are cut by the border. Positions are good to a
 pixel or two; `detect_crossings` and `detect_circles` make them precise.
 """
 
