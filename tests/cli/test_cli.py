@@ -50,7 +50,7 @@ def test_help_and_version_are_results(sfm, module, words):
     assert "Parallax" in result.stdout
 
 
-@pytest.mark.parametrize("module", ["calib", "stereo"])
+@pytest.mark.parametrize("module", ["stereo"])
 def test_commands_that_do_not_exist_yet_say_so(sfm, module):
     assert_one_line(sfm("camera", module=module), 2, "no commands yet")
     assert "nothing here yet" in sfm("--help", module=module).stdout

@@ -1,0 +1,174 @@
+"""Detections of a board in files, on several threads; those of files seen before come from a cache.
+
+A detection is kept under a digest of the file's content, the board, the settings and the source of the detector. So a
+renamed or copied photo is known, and nothing is served that another version found.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import calib
+from calib.boards import Board
+from calib.detect import DetectConfig, Detection, detect_board
+from sfm.core.errors import ImageError, InputError, Rejected
+from sfm.core.events import SILENT, ImageRead, Observer, StageFinished, StageStarted
+from sfm.core.execution import available_threads, ordered_map
+from sfm.io.atomic import write_text
+from sfm.io.images import list_images, read_image
+from sfm.io.kernel_cache import user_cache_folder
+
+STAGE = "detection"
+_SOURCES = ("boards.py", "detect*.py", "_detect_kernels.py")
+
+
+def find_photos(sources: Sequence[Path]) -> dict[str, Path]:
+    """The image files of folders, and files that are named themselves, by name relative to their folder.
+
+    Raises:
+        InputError: a folder is missing, there is no image at all, or two have one name.
+    """
+    photos: dict[str, Path] = {}
+    for source in sources:
+        found = {source.name: source}
+        if source.is_dir() or not source.exists():
+            found = {name: source / name for name in list_images(source).names}
+        if twice := photos.keys() & found.keys():
+            raise InputError(f"{min(twice)} is there twice", path=source, remedy="name one folder")
+        photos |= found
+    if not photos:
+        raise InputError("holds no image", path=sources[0] if sources else None)
+    return photos
+
+
+def detect_photos(
+    photos: Mapping[str, Path],
+    board: Board,
+    config: DetectConfig = DetectConfig(),
+    *,
+    threads: int = 0,
+    cache: Path | None = None,
+    observer: Observer = SILENT,
+) -> dict[str, Detection | Rejected]:
+    """What is seen in each photo, in the order of `photos`; a file that cannot be read is a rejection as well.
+
+    Args:
+        threads: 0 for all cores. The result does not depend on it.
+        cache: folder of detections that are known; see `detection_cache`.
+    """
+    observer(StageStarted(stage=STAGE, total=len(photos)))
+
+    def seen(item: tuple[str, Path]) -> Detection | Rejected:
+        name, path = item
+        try:
+            return _detect_file(name, path, board, config, cache)
+        except ImageError as error:
+            return Rejected("unreadable", error.cause)
+
+    result: dict[str, Detection | Rejected] = {}
+    # OpenCV's own threads would fight over the cores that the photos share.
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        found = ordered_map(seen, photos.items(), threads=threads or available_threads())
+        for name, detection in zip(photos, found, strict=True):
+            result[name] = detection
+            observer(ImageRead(name=name, reason="" if detection else detection.reason))
+    finally:
+        cv2.setNumThreads(before)
+    count = sum(isinstance(detection, Detection) for detection in result.values())
+    observer(StageFinished(stage=STAGE, summary=f"{count} of {len(photos)} photos show the board"))
+    return result
+
+
+def detection_cache() -> Path:
+    """The folder in the user's cache."""
+    return user_cache_folder() / "boards"
+
+
+def detection_json(seen: Detection | Rejected) -> dict[str, Any]:
+    """A detection as plain values; every number reads back as it is."""
+    if not isinstance(seen, Detection):
+        return {"reason": seen.reason, "detail": seen.detail}
+    return {
+        "name": seen.name,
+        "width": seen.width,
+        "height": seen.height,
+        "finder": seen.finder,
+        "blur_px": None if np.isnan(seen.blur_px) else seen.blur_px,
+        "corner_ids": seen.corner_ids.tolist(),
+        "points2D": seen.points2D.tolist(),
+        "covariances": seen.covariances.tolist(),
+        "rejected": {str(number): reason for number, reason in seen.rejected.items()},
+        "rejected2D": seen.rejected2D.tolist(),
+    }
+
+
+def detection_from_json(values: Mapping[str, Any]) -> Detection | Rejected:
+    """The inverse of `detection_json`."""
+    if "reason" in values:
+        return Rejected(values["reason"], values["detail"])
+    return Detection(
+        values["name"],
+        values["width"],
+        values["height"],
+        np.array(values["corner_ids"], np.int64),
+        np.array(values["points2D"], np.float64).reshape(-1, 2),
+        np.array(values["covariances"], np.float64).reshape(-1, 2, 2),
+        {int(number): reason for number, reason in values["rejected"].items()},
+        np.array(values["rejected2D"], np.float64).reshape(-1, 2),
+        values["finder"],
+        float("nan") if values["blur_px"] is None else values["blur_px"],
+    )
+
+
+def _detect_file(name: str, path: Path, board: Board, config: DetectConfig, cache: Path | None) -> Detection | Rejected:
+    if cache is None:
+        return detect_board(read_image(path, gray=True), board, config, name=name)
+    kept = cache / f"{_key(path, board, config)}.json"
+    known = _known(kept, name)
+    if known is not None:
+        return known
+    seen = detect_board(read_image(path, gray=True), board, config, name=name)
+    with contextlib.suppress(InputError):  # a cache that cannot be written to costs time, nothing else
+        write_text(kept, json.dumps(detection_json(seen)))
+    return seen
+
+
+def _known(kept: Path, name: str) -> Detection | Rejected | None:
+    try:
+        seen = detection_from_json(json.loads(kept.read_bytes()))
+    except (OSError, ValueError, KeyError, TypeError):  # never written, or broken: then it is found anew
+        return None
+    return dataclasses.replace(seen, name=name) if isinstance(seen, Detection) else seen
+
+
+def _key(path: Path, board: Board, config: DetectConfig) -> str:
+    digest = hashlib.blake2b(digest_size=20)
+    try:
+        digest.update(path.read_bytes())
+    except OSError as error:
+        raise ImageError((error.strerror or str(error)).lower(), path=path) from error
+    digest.update("\n".join([board.spec, repr(config), cv2.__version__, _version_of_detector()]).encode())
+    return digest.hexdigest()
+
+
+@functools.cache
+def _version_of_detector() -> str:
+    """A digest of all sources on which a detection depends."""
+    folder = Path(calib.__file__).parent
+    digest = hashlib.blake2b(digest_size=16)
+    for pattern in _SOURCES:
+        for path in sorted(folder.glob(pattern)):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
