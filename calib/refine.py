@@ -1,0 +1,448 @@
+"""Calibration of one camera from photos of a board: from corners to a camera, poses, the board's shape, and doubts.
+
+    sort out views → start (`zhang`) → release parameters in stages, on some views → all views → reject → verdict
+
+What is rejected is told with its reason. Where the views leave the principal point open it is held at the centre of the
+image, and where they leave the focal length open there is no camera: `Rejected`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from calib.refine_board import BoardShape, ShapeKind, board_shape
+from calib.refine_lenses import Lens, lens_by_name
+from calib.refine_system import CalibrationSystem, Estimate
+from calib.refine_views import BoardView, Observations, gather
+from calib.zhang import Start, find_start, fit_view_homographies, largest_angle_between, poses_of_views
+from sfm.core.arrays import BoolArray, FloatArray, Points3D, Value, Vector
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
+from sfm.core.optim.losses import Loss
+
+_NOT_A_BOARD = 0.2
+"""RMS error of a view's homography over the spread of its corners. Fisheye views stay below 0.1; corners in a wrong
+order are near 0.5."""
+_GROSS = 6.0
+"""Worst homography over the median one, beyond which single corners are suspected of being far off."""
+_RAYLEIGH_MEDIAN = 1.17741
+"""Median length of a pair of unit normal numbers."""
+_SEED_VIEWS = 14
+_OPEN_FOCAL = 0.1
+"""Standard deviation of a focal length over itself, beyond which it is not determined."""
+_OPEN_CENTER = 0.1
+"""Standard deviation of the principal point over the longer side, beyond which it is not determined."""
+_ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
+_ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationConfig:
+    """How a camera is calibrated."""
+
+    lens: str = "opencv5"
+    """Row of `refine_lenses.LENSES`."""
+    shape: ShapeKind = "flat"
+    """What the board may be; see `refine_board`."""
+    focal_px: float | None = None
+    """First guess where it is known; it is refined."""
+    reject: bool = True
+    """Leave out corners and views that do not fit."""
+    min_views: int = 3
+    """Below it one bad view could not be told."""
+    min_corners: int = 6
+    """In a view; a homography takes 4 and says nothing of their quality."""
+    reject_beyond_sigma: float = 5.0
+    """A corner farther off starts the rejection; one of 270 000 right ones is."""
+    keep_within_sigma: float = 4.0
+    """What rejection then cuts at; as mrcal does."""
+    max_iterations: int = 500
+    relative_cost_tolerance: float = 1e-13
+    """Close to rounding, so that nothing is left of the way there."""
+    keep_invertible: bool = True
+    """No corner may lie where the distortion turns back. A rational polynomial can fit a little better otherwise."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class RejectedView:
+    """A view that is left out, and why."""
+
+    name: str
+    reason: str
+    detail: str = ""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Calibration(Value):
+    """A camera with what it was made from.
+
+    Attributes:
+        cams_from_board: batch (V,), in the board's unit, of the views of `observations`.
+        free_names: the parameters that were estimated; the others are as they started.
+        observations: of the views and corners that were used.
+        residuals: (n, 2) projected − observed, px.
+        rejected_views, rejected_corners: what was left out; corners as (name of the view, row of the board's point).
+        rms_px: root of the mean squared length of residuals, as OpenCV has it.
+        sigma_px: standard deviation of one coordinate, √(Σ r² / (2 n − parameters)); whitened where covariances differ.
+        rung: how the start was found; see `zhang`.
+        fallbacks: what was not estimated as asked, in words.
+        converged: the last steps brought no more than rounding.
+    """
+
+    lens: str
+    camera: Camera
+    cams_from_board: Rigid3
+    shape: BoardShape
+    free_names: tuple[str, ...]
+    observations: Observations
+    residuals: Float64[np.ndarray, "n 2"]
+    rejected_views: tuple[RejectedView, ...]
+    rejected_corners: tuple[tuple[str, int], ...]
+    rms_px: float
+    sigma_px: float
+    rung: str
+    fallbacks: tuple[str, ...]
+    converged: bool
+    iterations: int
+    cost: float
+
+    @property
+    def estimate(self) -> Estimate:
+        """As the solver wants it."""
+        poses = self.cams_from_board
+        return Estimate(self.camera, poses.rotation.matrix, np.array(poses.translation), self.shape)
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Positions of the free parameters."""
+        return np.flatnonzero([name in self.free_names for name in self.camera.model_info.param_names])
+
+    @property
+    def view_rms_px(self) -> Vector:
+        """(V,) as `rms_px`, of each view."""
+        sums = np.bincount(self.observations.view_of, np.sum(self.residuals**2, 1), len(self.observations))
+        return np.sqrt(sums / np.diff(self.observations.offsets))
+
+    def system(self) -> CalibrationSystem:
+        """The problem at its solution."""
+        free_shape = len(self.shape.coefficients) > 0
+        return CalibrationSystem(self.observations, self.estimate, self.columns, free_shape=free_shape)
+
+
+def calibrate(
+    board: Points3D, views: Sequence[BoardView], config: CalibrationConfig = CalibrationConfig()
+) -> Calibration | Rejected:
+    """The camera that took photos of a board.
+
+    Args:
+        board: (N, 3) its points in metres, or in any other unit; z = 0.
+        views: photos of it; those of another size than most are rejected.
+    Returns:
+        `too_few_views`, with what is wrong with the views that cannot be used; `undetermined_focal` where the boards
+        are parallel to one another or to the image; `no_solution` where the minimum was not found.
+    Raises:
+        ValueError: the lens or the shape is unknown, a corner is not of the board, or the board is not flat.
+    """
+    lens = lens_by_name(config.lens)
+    if np.any(board[:, 2] != 0):
+        raise ValueError("the board's points must have z = 0; its shape is estimated")
+    usable, rejected = sort_out(board, views, config)
+    if len(usable) < config.min_views:
+        return Rejected("too_few_views", _told(len(usable), config.min_views, rejected))
+    observations = gather(board, usable)
+    start = find_start(observations, lens, config.focal_px)
+    if isinstance(start, Rejected):
+        return start
+    shape = board_shape(config.shape, observations.board, np.bincount(observations.rows, minlength=len(board)))
+    fit = _Fit(lens, config, start, shape)
+    estimate = fit.seed(observations)
+    if isinstance(estimate, Rejected):
+        return estimate
+    system, summary = fit.solve(observations, estimate)
+    corners: list[tuple[str, int]] = []
+    if config.reject:
+        system, summary, more = _reject(fit, system, summary, corners)
+        rejected += more
+        if len(system.observations) < config.min_views:
+            return Rejected("too_few_views", _told(len(system.observations), config.min_views, rejected))
+    checked = _determined(fit, system, summary)
+    if isinstance(checked, Rejected):
+        return checked
+    system, summary, columns, fallbacks = checked
+    if start.rung == "tried" and lens.start == "perspective":
+        fallbacks = (
+            f"focal lengths were tried for a start, since {start.detail or 'the closed form failed'}",
+            *fallbacks,
+        )
+    return _result(fit, system, summary, columns, rejected, corners, fallbacks)
+
+
+def sort_out(
+    board: FloatArray, views: Sequence[BoardView], config: CalibrationConfig
+) -> tuple[list[BoardView], list[RejectedView]]:
+    """Views that can be used, and the others: another size, too few corners, corners on a line or in a wrong order."""
+    sizes = [(view.width, view.height) for view in views]
+    common = max(sorted(set(sizes)), key=sizes.count) if sizes else (0, 0)
+    usable, rejected = [], []
+    for view, size in zip(views, sizes, strict=True):
+        if size != common:
+            detail = f"{size[0]}x{size[1]} among photos of {common[0]}x{common[1]}"
+            rejected.append(RejectedView(view.name, "other_size", detail))
+        elif len(view.corner_ids) < config.min_corners:
+            detail = f"{len(view.corner_ids)} of {config.min_corners} needed"
+            rejected.append(RejectedView(view.name, "too_few_corners", detail))
+        else:
+            usable.append(view)
+    if not usable:
+        return usable, rejected
+    observations = gather(board, usable)
+    found = fit_view_homographies(observations)
+    turns = np.sign(_orientation(observations, found.matrices))
+    usual = 1.0 if np.sum(turns > 0) >= np.sum(turns < 0) else -1.0
+    spreads = _spreads(observations)
+    kept = []
+    for view, error, spread, turn in zip(usable, found.errors, spreads, turns, strict=True):
+        if not np.isfinite(error):
+            rejected.append(RejectedView(view.name, "corners_on_a_line"))
+        elif error > _NOT_A_BOARD * spread:
+            detail = f"{error:.1f} px from a flat board: corners in a wrong order, or rows and columns swapped"
+            rejected.append(RejectedView(view.name, "not_this_board", detail))
+        elif turn != usual:
+            rejected.append(RejectedView(view.name, "mirrored", "corners run the other way round than in most views"))
+        else:
+            kept.append(view)
+    return kept, rejected
+
+
+def _orientation(observations: Observations, H: FloatArray) -> Vector:
+    """(V,) positive where the board's x and y turn as those of the image do, at the middle of what is seen.
+
+    The sign of det ∂(u, v)/∂(x, y) = det H / w³, and w is positive there.
+    """
+    return np.linalg.det(np.where(np.isfinite(H), H, 0.0)) if len(observations) else np.zeros(0)
+
+
+def _spreads(observations: Observations) -> Vector:
+    """(V,) root of the mean squared distance of a view's corners from their mean, px."""
+    counts, view = np.diff(observations.offsets), observations.view_of
+    means = np.stack([np.bincount(view, observations.points2D[:, k]) / counts for k in range(2)], 1)
+    squares = np.sum((observations.points2D - means[view]) ** 2, axis=1)
+    return np.sqrt(np.bincount(view, squares) / counts)
+
+
+def _told(count: int, needed: int, rejected: Sequence[RejectedView]) -> str:
+    reasons = "; ".join(f"{view.name}: {view.reason} {view.detail}".strip() for view in rejected[:5])
+    return f"{count} of {needed} needed" + (f" ({reasons})" if reasons else "")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """One way to fit: what does not change between the attempts."""
+
+    lens: Lens
+    config: CalibrationConfig
+    start: Start
+    shape: BoardShape
+
+    def seed(self, observations: Observations) -> Estimate | Rejected:
+        """Camera and poses by releasing parameters in stages, on some of the views where there are many."""
+        views = len(observations)
+        some = sorted(set(np.linspace(0, views - 1, min(views, _SEED_VIEWS)).astype(int).tolist()))
+        seeds = observations if len(some) == views else observations.of_views(some)
+        errors = fit_view_homographies(seeds).errors
+        gross = self.config.reject and bool(errors.max() > _GROSS * np.median(errors))
+        estimate = self.placed(seeds, self.start.camera, gross)
+        if isinstance(estimate, Rejected):
+            return estimate
+        for stage in range(1, len(self.lens.stages) + 1):
+            last = stage == len(self.lens.stages)
+            if last and len(some) == views:
+                break
+            system = self.system(seeds, estimate, stage, "cauchy" if gross else "trivial", 2.0, shaped=False)
+            minimize(system, _ROUGH)
+            estimate = system.estimate
+        return estimate if len(some) == views else self.placed(observations, estimate.camera, gross)
+
+    def placed(self, observations: Observations, camera: Camera, robust: bool) -> Estimate | Rejected:
+        """All views with this camera, in closed form."""
+        R, t, errors = poses_of_views(observations, camera, robust=robust)
+        lost = np.flatnonzero(~np.isfinite(errors) | ~np.isfinite(t).all(1))
+        if len(lost):
+            return Rejected("no_solution", f"{observations.names[lost[0]]} has no pose with the first camera")
+        return Estimate(camera, R, t, self.shape)
+
+    def system(
+        self, observations: Observations, estimate: Estimate, stages: int | None = None, loss: Loss = "trivial",
+        scale: float = 1.0, shaped: bool = True, columns: np.ndarray | None = None,
+    ) -> CalibrationSystem:  # fmt: skip
+        return CalibrationSystem(
+            observations,
+            estimate,
+            self.lens.columns(stages) if columns is None else columns,
+            free_shape=shaped and self.shape.basis.shape[2] > 0,
+            loss=loss,
+            loss_scale=scale,
+            keep_invertible=self.config.keep_invertible,
+        )
+
+    def solve(
+        self, observations: Observations, estimate: Estimate, columns: np.ndarray | None = None
+    ) -> tuple[CalibrationSystem, Summary]:
+        """Least squares, to the end."""
+        system = self.system(observations, estimate, columns=columns)
+        rules = StopRules(
+            max_iterations=self.config.max_iterations,
+            relative_cost_tolerance=self.config.relative_cost_tolerance,
+            gradient_tolerance=0.0,
+        )
+        return system, minimize(system, rules)
+
+
+def _lengths(system: CalibrationSystem) -> Vector:
+    """(n,) lengths of the whitened residuals; inf where there is no projection."""
+    r, roots = system.residuals(), system.observations.roots
+    lengths = np.hypot(roots[:, 0] * r[:, 0] + roots[:, 1] * r[:, 1], roots[:, 2] * r[:, 1])
+    return np.where(np.isfinite(lengths), lengths, np.inf)
+
+
+def _reject(
+    fit: _Fit, system: CalibrationSystem, summary: Summary, corners: list[tuple[str, int]]
+) -> tuple[CalibrationSystem, Summary, list[RejectedView]]:
+    """Refits without corners beyond some σ, and without views that lost half of theirs, until all are within."""
+    config, rejected = fit.config, []
+    for _ in range(6):
+        lengths = _lengths(system)
+        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)
+        if not lengths.max() > config.reject_beyond_sigma * sigma:
+            break
+        # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
+        robust = fit.system(system.observations, system.estimate, loss="cauchy", scale=2 * sigma)
+        minimize(robust, _ROBUST)
+        lengths = _lengths(robust)
+        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)
+        kept = lengths <= config.keep_within_sigma * sigma
+        if np.all(kept):
+            break
+        views, gone = _without_bad_views(robust.observations, kept, lengths, sigma, config.min_corners)
+        rejected += gone
+        if len(views) < config.min_views:
+            return system, summary, rejected
+        left = robust.observations.of_views(views)
+        inside = np.concatenate([kept[slice(*robust.observations.offsets[[v, v + 1]])] for v in views])
+        names, rows = np.array(left.names, object)[left.view_of], left.rows
+        corners += [(str(names[n]), int(rows[n])) for n in np.flatnonzero(~inside)]
+        system, summary = fit.solve(left.of_corners(inside), robust.estimate.of_views(views))
+    return system, summary, rejected
+
+
+def _without_bad_views(
+    observations: Observations, kept: BoolArray, lengths: Vector, sigma: float, min_corners: int
+) -> tuple[list[int], list[RejectedView]]:
+    """Views to go on with, and those whose corners are mostly outliers."""
+    good, bad = [], []
+    for v, name in enumerate(observations.names):
+        inside = kept[observations.offsets[v] : observations.offsets[v + 1]]
+        if inside.sum() >= max(min_corners, 0.5 * len(inside)):
+            good.append(v)
+            continue
+        typical = float(np.median(lengths[observations.offsets[v] : observations.offsets[v + 1]]))
+        detail = f"{int((~inside).sum())} of {len(inside)} corners beyond limits; median {typical / sigma:.1f} sigma"
+        bad.append(RejectedView(name, "outlier_view", detail))
+    return good, bad
+
+
+_Checked = tuple[CalibrationSystem, Summary, np.ndarray, tuple[str, ...]]
+
+
+def _determined(fit: _Fit, system: CalibrationSystem, summary: Summary) -> _Checked | Rejected:
+    """Holds the principal point where the views leave it open; refuses where they leave the focal length open."""
+    names = np.array(system.estimate.camera.model_info.param_names)
+    columns, longer = fit.lens.columns(), max(system.observations.width, system.observations.height)
+    deviations = _deviations(system, summary, names[columns])
+    focal = [d for name, d in deviations.items() if name.startswith("f")]
+    center = [d for name, d in deviations.items() if name.startswith("c")]
+    fallbacks: tuple[str, ...] = ()
+    mean = system.estimate.camera.mean_focal_length
+    if max(center) > _OPEN_CENTER * longer or max(focal) > _OPEN_FOCAL * mean:
+        columns = np.array([k for k in columns if not names[k].startswith("c")])
+        fallbacks = (f"principal point held at the centre of the image: {_tilts_in_words(system)}",)
+        camera = fit.start.camera
+        centred = fit.lens.camera(
+            camera.width, camera.height, *camera.focal_lengths, camera.width / 2, camera.height / 2
+        )
+        estimate = fit.placed(system.observations, centred, False)
+        if isinstance(estimate, Rejected):
+            return estimate
+        system, summary = fit.solve(system.observations, estimate, columns)
+        deviations = _deviations(system, summary, names[columns])
+        focal = [d for name, d in deviations.items() if name.startswith("f")]
+        mean = system.estimate.camera.mean_focal_length
+    if not (max(focal) <= _OPEN_FOCAL * mean and mean < 20 * longer):
+        return Rejected(
+            "undetermined_focal", f"focal length {mean:.0f} ± {max(focal):.0f} px: {_tilts_in_words(system)}"
+        )
+    return system, summary, columns, fallbacks
+
+
+def _deviations(system: CalibrationSystem, summary: Summary, names: Sequence[str]) -> dict[str, float]:
+    """Standard deviation of each free parameter, inf where nothing determines them."""
+    inverse = system.shared_inverse()
+    freedom = max(2 * len(system.observations.rows) - 6 * len(system.observations) - system.shared_count, 1)
+    noise = 2 * summary.final_cost / freedom
+    if inverse is None:
+        return dict.fromkeys(names, math.inf)
+    # Noise-free views that leave something open have no noise to tell so.
+    floor = 1e-6
+    return dict(zip(names, np.sqrt(np.diag(inverse)[: len(names)] * max(noise, floor)).tolist(), strict=True))
+
+
+def _tilts_in_words(system: CalibrationSystem) -> str:
+    """How the boards stand to one another and to the image, in degrees."""
+    normals = system.estimate.rotations[:, :, 2]
+    between = np.rad2deg(largest_angle_between(normals))
+    axis = np.rad2deg(np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)))
+    directions = normals[:, :2] / np.maximum(np.linalg.norm(normals[:, :2], axis=1, keepdims=True), 1e-12)
+    spread = np.linalg.svd(directions[axis > 5.0], compute_uv=False) if np.sum(axis > 5.0) > 1 else np.array([1.0, 0])
+    views = f"all {len(normals)} views"
+    if axis.max() < 8.0:
+        return f"{views} within {axis.max():.0f} degrees of the image plane; tilt the board by 15 to 45 degrees"
+    if between < 8.0:
+        return f"{views} within {between:.0f} degrees of parallel; tilt the board by 15 to 45 degrees about two axes"
+    if spread[-1] < 0.2 * spread[0]:
+        return f"{views} are tilted about one axis only; tilt the board about the other one, too"
+    return f"tilts to {axis.max():.0f} degrees are too few or too alike; add views that fill the image"
+
+
+def _result(
+    fit: _Fit, system: CalibrationSystem, summary: Summary, columns: np.ndarray, rejected: list[RejectedView],
+    corners: list[tuple[str, int]], fallbacks: tuple[str, ...],
+) -> Calibration:  # fmt: skip
+    observations, residuals = system.observations, system.residuals()
+    estimate = system.estimate
+    names = estimate.camera.model_info.param_names
+    freedom = 2 * len(observations.rows) - 6 * len(observations) - system.shared_count
+    return Calibration(
+        lens=fit.lens.name,
+        camera=estimate.camera,
+        cams_from_board=estimate.cams_from_board,
+        shape=estimate.shape,
+        free_names=tuple(names[k] for k in columns),
+        observations=observations,
+        residuals=residuals,
+        rejected_views=tuple(rejected),
+        rejected_corners=tuple(corners),
+        rms_px=math.sqrt(float(np.sum(residuals**2)) / len(residuals)),
+        sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
+        rung=fit.start.rung,
+        fallbacks=fallbacks,
+        converged=summary.reason != "max_iterations",
+        iterations=len(summary.iterations) - 1,
+        cost=summary.final_cost,
+    )
