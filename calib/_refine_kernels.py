@@ -30,21 +30,22 @@ def evaluate_views(
     model_id, params, columns, squared_limit, rotations, translations, offsets, rows, board, basis, observed, roots,
     loss, scale, lost_cost, costs, blocks, residuals,
 ):  # fmt: skip
-    """Fills the cost of each view, its block, and the residuals (n, 2) in px, NaN where there is no projection.
+    """Fills the cost of each view and its block, or instead of blocks the residuals (n, 2) in px where they are wanted.
 
     Args:
         columns: free parameters; squared_limit: see `distortion_limit`.
         board: (P, 3) at the current shape; basis: (P, 3, S) its derivatives by the free coefficients.
         roots: (n, 3) a, b, c of the whitening (a du + b dv, c dv).
         lost_cost: cost of an observation without projection.
-        residuals: empty where they are not wanted.
+        residuals: empty where they are not wanted; NaN where there is no projection.
     """
     shape = basis.shape[2]
     width = POSE + len(columns) + shape + 1
     w = np.empty((_COLUMNS + 2 * width) * LANES)
     for view in range(len(offsets) - 1):
         R, t = rotations[view], translations[view]
-        blocks[view] = 0.0
+        if not len(residuals):
+            blocks[view] = 0.0
         cost = 0.0
         for first in range(offsets[view], offsets[view + 1], LANES):
             last = min(first + LANES, offsets[view + 1])
@@ -56,6 +57,7 @@ def evaluate_views(
                     seen = w[OK * LANES + n - first] > 0.0
                     residuals[n, 0] = w[U * LANES + n - first] - observed[n, 0] if seen else math.nan
                     residuals[n, 1] = w[V * LANES + n - first] - observed[n, 1] if seen else math.nan
+                continue
             _derive_by_pose(w)
             for k in range(len(columns)):
                 fill_by_param(model_id, params, columns[k], w)

@@ -19,7 +19,7 @@ from calib.refine_board import BoardShape, ShapeKind, board_shape
 from calib.refine_lenses import Lens, lens_by_name
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_views import BoardView, Observations, gather
-from calib.zhang import Start, find_start, fit_view_homographies, largest_angle_between, poses_of_views
+from calib.zhang import Homographies, Start, find_start, fit_view_homographies, largest_angle_between, poses_of_views
 from sfm.core.arrays import BoolArray, FloatArray, Points3D, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -39,6 +39,8 @@ _OPEN_FOCAL = 0.1
 """Standard deviation of a focal length over itself, beyond which it is not determined."""
 _OPEN_CENTER = 0.1
 """Standard deviation of the principal point over the longer side, beyond which it is not determined."""
+_NEAR = 1e-6
+"""Damping near the minimum over the usual one."""
 _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
 _ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
 
@@ -153,16 +155,15 @@ def calibrate(
     lens = lens_by_name(config.lens)
     if np.any(board[:, 2] != 0):
         raise ValueError("the board's points must have z = 0; its shape is estimated")
-    usable, rejected = sort_out(board, views, config)
-    if len(usable) < config.min_views:
-        return Rejected("too_few_views", _told(len(usable), config.min_views, rejected))
-    observations = gather(board, usable)
-    start = find_start(observations, lens, config.focal_px)
+    observations, homographies, rejected = sort_out(board, views, config)
+    if len(observations) < config.min_views:
+        return Rejected("too_few_views", _told(len(observations), config.min_views, rejected))
+    start = find_start(observations, homographies, lens, config.focal_px)
     if isinstance(start, Rejected):
         return start
     shape = board_shape(config.shape, observations.board, np.bincount(observations.rows, minlength=len(board)))
     fit = _Fit(lens, config, start, shape)
-    estimate = fit.seed(observations)
+    estimate = fit.seed(observations, homographies.errors)
     if isinstance(estimate, Rejected):
         return estimate
     system, summary = fit.solve(observations, estimate)
@@ -186,7 +187,7 @@ def calibrate(
 
 def sort_out(
     board: FloatArray, views: Sequence[BoardView], config: CalibrationConfig
-) -> tuple[list[BoardView], list[RejectedView]]:
+) -> tuple[Observations, Homographies, list[RejectedView]]:
     """Views that can be used, and the others: another size, too few corners, corners on a line or in a wrong order."""
     sizes = [(view.width, view.height) for view in views]
     common = max(sorted(set(sizes)), key=sizes.count) if sizes else (0, 0)
@@ -200,33 +201,29 @@ def sort_out(
             rejected.append(RejectedView(view.name, "too_few_corners", detail))
         else:
             usable.append(view)
-    if not usable:
-        return usable, rejected
     observations = gather(board, usable)
     found = fit_view_homographies(observations)
-    turns = np.sign(_orientation(observations, found.matrices))
-    usual = 1.0 if np.sum(turns > 0) >= np.sum(turns < 0) else -1.0
-    spreads = _spreads(observations)
-    kept = []
-    for view, error, spread, turn in zip(usable, found.errors, spreads, turns, strict=True):
-        if not np.isfinite(error):
-            rejected.append(RejectedView(view.name, "corners_on_a_line"))
-        elif error > _NOT_A_BOARD * spread:
-            detail = f"{error:.1f} px from a flat board: corners in a wrong order, or rows and columns swapped"
-            rejected.append(RejectedView(view.name, "not_this_board", detail))
-        elif turn != usual:
-            rejected.append(RejectedView(view.name, "mirrored", "corners run the other way round than in most views"))
-        else:
-            kept.append(view)
-    return kept, rejected
+    H, errors = found.matrices, found.errors
+    flat = np.isfinite(errors)
+    fits = flat & (errors <= _NOT_A_BOARD * _spreads(observations))
+    # det ∂(u, v)/∂(x, y) = det H / w³ has the sign of det H, as w is positive on what is seen.
+    turns = np.linalg.det(np.where(np.isfinite(H), H, 0.0)) > 0
+    alike = turns == (np.sum(turns & fits) * 2 >= np.sum(fits))
+    out = np.flatnonzero(~(fits & alike))
+    rejected += [RejectedView(observations.names[v], *_why_not(flat[v], fits[v], errors[v])) for v in out]
+    if np.all(fits & alike):
+        return observations, found, rejected
+    kept = np.flatnonzero(fits & alike).tolist()
+    return observations.of_views(kept), Homographies(H[kept], errors[kept]), rejected
 
 
-def _orientation(observations: Observations, H: FloatArray) -> Vector:
-    """(V,) positive where the board's x and y turn as those of the image do, at the middle of what is seen.
-
-    The sign of det ∂(u, v)/∂(x, y) = det H / w³, and w is positive there.
-    """
-    return np.linalg.det(np.where(np.isfinite(H), H, 0.0)) if len(observations) else np.zeros(0)
+def _why_not(flat: bool, fits: bool, error: float) -> tuple[str, str]:
+    if not flat:
+        return "corners_on_a_line", "they determine no homography"
+    if not fits:
+        detail = f"{error:.1f} px from a flat board: corners in a wrong order, or rows and columns swapped"
+        return "not_this_board", detail
+    return "mirrored", "corners run the other way round than in most views"
 
 
 def _spreads(observations: Observations) -> Vector:
@@ -251,12 +248,11 @@ class _Fit:
     start: Start
     shape: BoardShape
 
-    def seed(self, observations: Observations) -> Estimate | Rejected:
+    def seed(self, observations: Observations, errors: Vector) -> Estimate | Rejected:
         """Camera and poses by releasing parameters in stages, on some of the views where there are many."""
         views = len(observations)
         some = sorted(set(np.linspace(0, views - 1, min(views, _SEED_VIEWS)).astype(int).tolist()))
         seeds = observations if len(some) == views else observations.of_views(some)
-        errors = fit_view_homographies(seeds).errors
         gross = self.config.reject and bool(errors.max() > _GROSS * np.median(errors))
         estimate = self.placed(seeds, self.start.camera, gross)
         if isinstance(estimate, Rejected):
@@ -280,7 +276,7 @@ class _Fit:
 
     def system(
         self, observations: Observations, estimate: Estimate, stages: int | None = None, loss: Loss = "trivial",
-        scale: float = 1.0, shaped: bool = True, columns: np.ndarray | None = None,
+        scale: float = 1.0, shaped: bool = True, columns: np.ndarray | None = None, caution: float = 1.0,
     ) -> CalibrationSystem:  # fmt: skip
         return CalibrationSystem(
             observations,
@@ -290,13 +286,14 @@ class _Fit:
             loss=loss,
             loss_scale=scale,
             keep_invertible=self.config.keep_invertible,
+            caution=caution,
         )
 
     def solve(
         self, observations: Observations, estimate: Estimate, columns: np.ndarray | None = None
     ) -> tuple[CalibrationSystem, Summary]:
         """Least squares, to the end."""
-        system = self.system(observations, estimate, columns=columns)
+        system = self.system(observations, estimate, columns=columns, caution=_NEAR)
         rules = StopRules(
             max_iterations=self.config.max_iterations,
             relative_cost_tolerance=self.config.relative_cost_tolerance,
@@ -363,9 +360,9 @@ _Checked = tuple[CalibrationSystem, Summary, np.ndarray, tuple[str, ...]]
 
 def _determined(fit: _Fit, system: CalibrationSystem, summary: Summary) -> _Checked | Rejected:
     """Holds the principal point where the views leave it open; refuses where they leave the focal length open."""
-    names = np.array(system.estimate.camera.model_info.param_names)
+    names = system.estimate.camera.model_info.param_names
     columns, longer = fit.lens.columns(), max(system.observations.width, system.observations.height)
-    deviations = _deviations(system, summary, names[columns])
+    deviations = _deviations(system, summary, [names[k] for k in columns])
     focal = [d for name, d in deviations.items() if name.startswith("f")]
     center = [d for name, d in deviations.items() if name.startswith("c")]
     fallbacks: tuple[str, ...] = ()
@@ -381,7 +378,7 @@ def _determined(fit: _Fit, system: CalibrationSystem, summary: Summary) -> _Chec
         if isinstance(estimate, Rejected):
             return estimate
         system, summary = fit.solve(system.observations, estimate, columns)
-        deviations = _deviations(system, summary, names[columns])
+        deviations = _deviations(system, summary, [names[k] for k in columns])
         focal = [d for name, d in deviations.items() if name.startswith("f")]
         mean = system.estimate.camera.mean_focal_length
     if not (max(focal) <= _OPEN_FOCAL * mean and mean < 20 * longer):

@@ -6,9 +6,9 @@
     height       every point has its own z
     free         every point has its own x, y and z
 
-Displacements that a movement of the whole board would undo are left out, and for `free` those of a change of size, which
-nothing in photos tells: what remains is orthogonal to them, point by point with the same weight. So the true board is
-the given one with the least displacement.
+Displacements that a movement of the whole board would undo are left out, and for `free` those of a change of size,
+which nothing in photos tells: what remains is orthogonal to them, point by point with the same weight. So the true
+board is the given one with the least displacement.
 
 Reference:
     Strobl & Hirzinger, More accurate pinhole camera calibration with imperfect planar target, ICCV workshops 2011.

@@ -47,8 +47,7 @@ class Estimate(Value):
     @property
     def cams_from_board(self) -> Rigid3:
         """Poses, a batch (V,)."""
-        u, _, vt = np.linalg.svd(self.rotations)  # hundreds of products of rotations are none to the last bit
-        return Rigid3(Rotation3.from_matrix(u @ vt), self.translations)
+        return Rigid3(Rotation3.from_matrix(self.rotations), self.translations)
 
     def of_views(self, views: list[int]) -> Estimate:
         """With the poses of these views only."""
@@ -74,11 +73,13 @@ class CalibrationSystem:
         columns: positions of the parameters of the camera that are free; none refines poses alone.
         loss: of residuals in px (in units of their typical deviation where covariances were given), with its scale.
         keep_invertible: lets no observation lie where the distortion cannot be inverted.
+        caution: factor of the damping. A rational distortion is nearly undetermined in some directions, in which even
+            the loop's first damping, small as it is, holds back for tens of steps; near the minimum none is needed.
     """
 
     def __init__(
         self, observations: Observations, estimate: Estimate, columns: np.ndarray, *, free_shape: bool = False,
-        loss: Loss = "trivial", loss_scale: float = 1.0, keep_invertible: bool = True,
+        loss: Loss = "trivial", loss_scale: float = 1.0, keep_invertible: bool = True, caution: float = 1.0,
     ) -> None:  # fmt: skip
         self.observations, self._camera, self._shape = observations, estimate.camera, estimate.shape
         self._columns = np.asarray(columns, np.int64)
@@ -86,12 +87,12 @@ class CalibrationSystem:
         self._basis = basis if free_shape else np.ascontiguousarray(basis[:, :, :0])
         self._loss = loss_id(loss), float(loss_scale)
         self._lost = 0.5 * float(evaluate_loss(loss, np.array(_LOST_PX**2), loss_scale)[0])
-        self._keep_invertible = keep_invertible
+        self._keep_invertible, self._caution = keep_invertible, caution
         views, shared = len(observations), len(self._columns) + self._basis.shape[2]
         self._now = self._place(
             estimate.camera.params, estimate.shape.coefficients, estimate.rotations, estimate.translations
         )
-        self._trial = self._place(*(np.zeros(0),) * 2, np.empty((views, 3, 3)), np.empty((views, 3)))
+        self._trial = self._place(np.zeros(0), np.zeros(0), np.empty((views, 3, 3)), np.empty((views, 3)))
         self._evaluate(self._now)
         self._L, self._Y = np.zeros((views, 6, 6)), np.empty((views, 6, shared + 1))
         self._S, self._by_pose, self._by_shared = (
@@ -132,9 +133,10 @@ class CalibrationSystem:
         blocks = self._now.blocks
         diagonal = np.diagonal(blocks, axis1=1, axis2=2)
         gradient = blocks[:, -1, :-1]
-        self._diagonal = np.maximum(diagonal[:, :6], _FLOOR * diagonal[:, :6].max(initial=0.0))
+        floor = _FLOOR * diagonal[:, :6].max(initial=0.0)
+        self._diagonal = self._caution * np.maximum(diagonal[:, :6], floor)
         shared = diagonal[:, 6:-1].sum(0)
-        self._shared_diagonal = np.where(shared > 0, shared, 1.0)
+        self._shared_diagonal = self._caution * np.where(shared > 0, shared, 1.0)
         self._gradient = gradient[:, :6], gradient[:, 6:].sum(0)
         largest = max(float(np.abs(part).max(initial=0.0)) for part in self._gradient)
         return float(self._now.costs.sum()), largest

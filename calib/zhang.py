@@ -1,6 +1,7 @@
 """A first camera and first poses from photos of a flat board, in closed form.
 
-A board point (x, y, 0) goes to  H (x, y, 1)ᵀ ~ K [r1 r2 t] (x, y, 1)ᵀ.  As r1 and r2 are orthonormal, ω = (K Kᵀ)⁻¹ obeys
+A board point (x, y, 0) goes to  H (x, y, 1)ᵀ ~ K [r1 r2 t] (x, y, 1)ᵀ.  As r1 and r2 are orthonormal, ω = (K Kᵀ)⁻¹
+obeys
 
     h1ᵀ ω h2 = 0        h1ᵀ ω h1 = h2ᵀ ω h2
 
@@ -23,6 +24,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -34,6 +36,7 @@ from sfm.core.arrays import BoolArray, FloatArray, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 
+_Solver: TypeAlias = Callable[[FloatArray], tuple[float, float, float, float] | str]
 Rung: TypeAlias = Literal["closed_form", "centred", "one_focal", "tried", "given"]
 
 _SMALLEST, _LARGEST = 0.2, 20.0
@@ -46,6 +49,8 @@ _TRIALS = np.geomspace(0.15, 6.0, 24)
 """Focal lengths over the longer side that are tried: steps of 17 %."""
 _VIEWS_TRIED = 12
 _ROBUST_PASSES = 12
+_ENOUGH = 12
+"""Corners that a first pose is taken from."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -76,10 +81,13 @@ def fit_view_homographies(observations: Observations, *, robust: bool = False) -
     return Homographies(matrices, errors)
 
 
-def find_start(observations: Observations, lens: Lens, focal_px: float | None = None) -> Start | Rejected:
+def find_start(
+    observations: Observations, homographies: Homographies, lens: Lens, focal_px: float | None = None
+) -> Start | Rejected:
     """A first camera without distortion.
 
     Args:
+        homographies: of these views.
         focal_px: if given, it is taken and nothing else is tried.
     Returns:
         `undetermined_focal` where no rung of the ladder holds.
@@ -88,7 +96,7 @@ def find_start(observations: Observations, lens: Lens, focal_px: float | None = 
     if focal_px is not None:
         return Start(lens.camera(width, height, focal_px, focal_px, width / 2, height / 2), "given")
     if lens.start == "perspective":
-        found = intrinsics_from_homographies(fit_view_homographies(observations).matrices, width, height)
+        found = intrinsics_from_homographies(homographies.matrices, width, height)
         if not isinstance(found, Rejected):
             (fx, fy, cx, cy), rung, detail = found
             return Start(lens.camera(width, height, fx, fy, cx, cy), rung, detail)
@@ -111,7 +119,10 @@ def intrinsics_from_homographies(
     # Columns belong together: with the norm of both as unit, each view weighs the same.
     H = H / np.sqrt(np.sum(H[:, :, :2] ** 2, axis=(1, 2)))[:, None, None]
     equations, reasons = _equations(H), []
-    for rung, solve in (("closed_form", _solve_all), ("centred", _solve_two), ("one_focal", _solve_one)):
+    rungs: tuple[tuple[Rung, _Solver], ...] = (
+        ("closed_form", _solve_all), ("centred", _solve_two), ("one_focal", _solve_one),
+    )  # fmt: skip
+    for rung, solve in rungs:
         found = solve(equations)
         if isinstance(found, str):
             reasons.append(found)
@@ -129,8 +140,11 @@ def poses_of_views(
 ) -> tuple[FloatArray, FloatArray, Vector]:
     """Rotations (V, 3, 3), translations (V, 3) `cam_from_board` and the rms of tangents of angular errors (V,).
 
-    All are NaN for a view with too few corners, or whose corners have no ray.
+    All are NaN for a view with too few corners, or whose corners have no ray. Of views with many corners only some are
+    taken unless it must be `robust`.
     """
+    if not robust:
+        observations = _thinned(observations)
     rays, used = camera.unproject(observations.points2D)
     count = len(observations)
     rotations, translations, errors = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty(count)
@@ -139,6 +153,21 @@ def poses_of_views(
         rotations, translations, errors,
     )  # fmt: skip
     return rotations, translations, errors
+
+
+def _thinned(observations: Observations) -> Observations:
+    """At most `_ENOUGH` corners of each view, in steps of the golden section so that they lie on no line."""
+    counts = np.diff(observations.offsets)
+    if counts.max(initial=0) <= _ENOUGH:
+        return observations
+    kept = np.zeros(len(observations.rows), bool)
+    turns = np.arange(_ENOUGH) * 0.6180339887498949 % 1.0
+    kept[
+        (observations.offsets[:-1, None] + (turns * counts[:, None]).astype(int)).ravel()[
+            np.repeat(counts > 0, _ENOUGH)
+        ]
+    ] = True
+    return observations.of_corners(kept)
 
 
 def largest_angle_between(normals: FloatArray, mask: BoolArray | None = None) -> float:
@@ -170,10 +199,11 @@ def _solve_all(equations: FloatArray) -> tuple[float, float, float, float] | str
     A = equations.reshape(-1, 5)
     if len(A) < 4:
         return "one view does not determine fx, fy, cx and cy"
-    _, s, vt = np.linalg.svd(A)
-    if not s[3] > _SINGULAR * s[0]:
-        return f"boards are nearly parallel or tilted about one axis only (singular values {s[3] / s[0]:.1e})"
-    a, b, c, d, e = vt[4] * np.sign(vt[4, 0])
+    squares, vectors = np.linalg.eigh(A.T @ A)
+    ratio = math.sqrt(max(squares[1], 0.0) / squares[4])
+    if not ratio > _SINGULAR:
+        return f"boards are nearly parallel or tilted about one axis only (singular values {ratio:.1e})"
+    a, b, c, d, e = vectors[:, 0] * np.sign(vectors[0, 0])
     rest = c - d * d / a - e * e / b if a > 0 and b > 0 else -1.0
     if not rest > 0:
         return "the closed form has no real solution"
