@@ -41,6 +41,8 @@ _OPEN_CENTER = 0.1
 """Standard deviation of the principal point over the longer side, beyond which it is not determined."""
 _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
+_CONVERGED, _EXACT = 1e-9, 1e-20
+"""Part of the cost, and px² a corner, that need not be gained."""
 _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
 _ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
 
@@ -95,7 +97,8 @@ class Calibration(Value):
         sigma_px: standard deviation of one coordinate, √(Σ r² / (2 n − parameters)); whitened where covariances differ.
         rung: how the start was found; see `zhang`.
         fallbacks: what was not estimated as asked, in words.
-        converged: the last steps brought no more than rounding.
+        converged: another step, undamped, promises less than a billionth of the cost. It is False where the solution is
+            held back by `keep_invertible`: the lens model has more coefficients than the photos can bear.
     """
 
     lens: str
@@ -439,7 +442,7 @@ def _result(
         sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
         rung=fit.start.rung,
         fallbacks=fallbacks,
-        converged=summary.reason != "max_iterations",
+        converged=system.newton_decrement() <= _CONVERGED * summary.final_cost + _EXACT * len(residuals),
         iterations=len(summary.iterations) - 1,
         cost=summary.final_cost,
     )

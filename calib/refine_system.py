@@ -176,6 +176,12 @@ class CalibrationSystem:
         root = solve_triangular(self._S[:count, :count], np.eye(count), lower=True)
         return root.T @ root
 
+    def newton_decrement(self) -> float:
+        """What one more undamped step promises to take off the cost; inf where there is no such step."""
+        if self.shared_inverse() is None:
+            return math.inf
+        return -0.5 * float(np.vdot(self._gradient[0], self._by_pose) + self._gradient[1] @ self._by_shared)
+
     def accept(self) -> None:
         """Makes the last trial current."""
         self._now, self._trial = self._trial, self._now
