@@ -23,6 +23,7 @@ from calib.zhang import Homographies, Start, find_start, fit_view_homographies, 
 from sfm.core.arrays import BoolArray, FloatArray, Points3D, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
+from sfm.core.geometry.homogeneous import transform_points
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 from sfm.core.optim.losses import Loss
@@ -30,6 +31,8 @@ from sfm.core.optim.losses import Loss
 _NOT_A_BOARD = 0.2
 """RMS error of a view's homography over the spread of its corners. Fisheye views stay below 0.1; corners in a wrong
 order are near 0.5."""
+_MOSTLY = 0.1
+"""Part of that limit which the median corner must keep if some are far off."""
 _GROSS = 6.0
 """Worst homography over the median one, beyond which single corners are suspected of being far off."""
 _RAYLEIGH_MEDIAN = 1.17741
@@ -39,10 +42,13 @@ _OPEN_FOCAL = 0.1
 """Standard deviation of a focal length over itself, beyond which it is not determined."""
 _OPEN_CENTER = 0.1
 """Standard deviation of the principal point over the longer side, beyond which it is not determined."""
+_ROUNDS = 8
 _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
+_FRONTAL, _PARALLEL = math.radians(3.0), math.radians(6.0)
+"""Angles of boards to the image and to one another below which they are as good as none."""
 _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
 _ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
 
@@ -96,7 +102,7 @@ class Calibration(Value):
         rms_px: root of the mean squared length of residuals, as OpenCV has it.
         sigma_px: standard deviation of one coordinate, √(Σ r² / (2 n − parameters)); whitened where covariances differ.
         rung: how the start was found; see `zhang`.
-        fallbacks: what was not estimated as asked, in words.
+        fallbacks: what was not estimated as asked, or rests on little, in words.
         converged: another step, undamped, promises less than a billionth of the cost. It is False where the solution is
             held back by `keep_invertible`: the lens model has more coefficients than the photos can bear.
     """
@@ -164,7 +170,8 @@ def calibrate(
     start = find_start(observations, homographies, lens, config.focal_px)
     if isinstance(start, Rejected):
         return start
-    shape = board_shape(config.shape, observations.board, np.bincount(observations.rows, minlength=len(board)))
+    shown = np.bincount(observations.rows, minlength=len(board))
+    shape = board_shape(config.shape, observations.board, shown >= 2)
     fit = _Fit(lens, config, start, shape)
     estimate = fit.seed(observations, homographies.errors)
     if isinstance(estimate, Rejected):
@@ -207,13 +214,22 @@ def sort_out(
     observations = gather(board, usable)
     found = fit_view_homographies(observations)
     H, errors = found.matrices, found.errors
-    flat = np.isfinite(errors)
-    fits = flat & (errors <= _NOT_A_BOARD * _spreads(observations))
+    flat, limits = np.isfinite(errors), _NOT_A_BOARD * _spreads(observations)
+    fits = flat & (errors <= limits)
+    for v in np.flatnonzero(flat & ~fits) if config.reject else ():
+        # Single corners may be far off: most of them must fit.
+        one = observations.of_views([int(v)])
+        H[v] = fit_view_homographies(one, robust=True).matrices[0]
+        off = np.linalg.norm(transform_points(H[v], one.board[one.rows, :2]) - one.points2D, axis=1)
+        fits[v] = np.median(off) <= _MOSTLY * limits[v]
+        errors[v] = np.inf if fits[v] else errors[v]
     # det ∂(u, v)/∂(x, y) = det H / w³ has the sign of det H, as w is positive on what is seen.
     turns = np.linalg.det(np.where(np.isfinite(H), H, 0.0)) > 0
     alike = turns == (np.sum(turns & fits) * 2 >= np.sum(fits))
     out = np.flatnonzero(~(fits & alike))
-    rejected += [RejectedView(observations.names[v], *_why_not(flat[v], fits[v], errors[v])) for v in out]
+    rejected += [
+        RejectedView(observations.names[v], *_why_not(bool(flat[v]), bool(fits[v]), float(errors[v]))) for v in out
+    ]
     if np.all(fits & alike):
         return observations, found, rejected
     kept = np.flatnonzero(fits & alike).tolist()
@@ -256,7 +272,7 @@ class _Fit:
         views = len(observations)
         some = sorted(set(np.linspace(0, views - 1, min(views, _SEED_VIEWS)).astype(int).tolist()))
         seeds = observations if len(some) == views else observations.of_views(some)
-        gross = self.config.reject and bool(errors.max() > _GROSS * np.median(errors))
+        gross = self.config.reject and bool(np.isinf(errors).any() or errors.max() > _GROSS * np.median(errors))
         estimate = self.placed(seeds, self.start.camera, gross)
         if isinstance(estimate, Rejected):
             return estimate
@@ -315,31 +331,41 @@ def _lengths(system: CalibrationSystem) -> Vector:
 def _reject(
     fit: _Fit, system: CalibrationSystem, summary: Summary, corners: list[tuple[str, int]]
 ) -> tuple[CalibrationSystem, Summary, list[RejectedView]]:
-    """Refits without corners beyond some σ, and without views that lost half of theirs, until all are within."""
+    """Refits without corners beyond some σ, and without views that lose half of theirs.
+
+    Corners may come back: all are judged again by each new fit, until the choice stays.
+    """
     config, rejected = fit.config, []
-    for _ in range(6):
-        lengths = _lengths(system)
-        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)
-        if not lengths.max() > config.reject_beyond_sigma * sigma:
-            break
-        # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
-        robust = fit.system(system.observations, system.estimate, loss="cauchy", scale=2 * sigma)
-        minimize(robust, _ROBUST)
-        lengths = _lengths(robust)
-        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)
+    full, lengths = system.observations, _lengths(system)
+    if not lengths.max() > config.reject_beyond_sigma * _spread_of(lengths):
+        return system, summary, rejected
+    # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
+    judge = fit.system(full, system.estimate, loss="cauchy", scale=2 * _spread_of(lengths))
+    minimize(judge, _ROBUST)
+    before = None
+    for _ in range(_ROUNDS):
+        lengths = _lengths(judge)
+        sigma = _spread_of(lengths if before is None else lengths[before])
         kept = lengths <= config.keep_within_sigma * sigma
-        if np.all(kept):
-            break
-        views, gone = _without_bad_views(robust.observations, kept, lengths, sigma, config.min_corners)
+        views, gone = _without_bad_views(full, kept, lengths, sigma, config.min_corners)
         rejected += gone
         if len(views) < config.min_views:
-            return system, summary, rejected
-        left = robust.observations.of_views(views)
-        inside = np.concatenate([kept[slice(*robust.observations.offsets[[v, v + 1]])] for v in views])
-        names, rows = np.array(left.names, object)[left.view_of], left.rows
-        corners += [(str(names[n]), int(rows[n])) for n in np.flatnonzero(~inside)]
-        system, summary = fit.solve(left.of_corners(inside), robust.estimate.of_views(views))
+            return fit.system(full.of_views(views), judge.estimate.of_views(views)), summary, rejected
+        if before is not None and not gone and np.array_equal(kept, before):
+            break
+        inside = np.concatenate([kept[full.offsets[v] : full.offsets[v + 1]] for v in views])
+        full = full.of_views(views)
+        system, summary = fit.solve(full.of_corners(inside), judge.estimate.of_views(views))
+        judge, before = fit.system(full, system.estimate), inside
+    if before is not None:
+        names, views_of = full.names, full.view_of
+        corners += [(names[views_of[n]], int(full.rows[n])) for n in np.flatnonzero(~before)]
     return system, summary, rejected
+
+
+def _spread_of(lengths: Vector) -> float:
+    """The standard deviation of a coordinate by the median length."""
+    return max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)
 
 
 def _without_bad_views(
@@ -369,10 +395,11 @@ def _determined(fit: _Fit, system: CalibrationSystem, summary: Summary) -> _Chec
     focal = [d for name, d in deviations.items() if name.startswith("f")]
     center = [d for name, d in deviations.items() if name.startswith("c")]
     fallbacks: tuple[str, ...] = ()
+    between, _, one_axis = _tilts(system.estimate.rotations)
     mean = system.estimate.camera.mean_focal_length
     if max(center) > _OPEN_CENTER * longer or max(focal) > _OPEN_FOCAL * mean:
         columns = np.array([k for k in columns if not names[k].startswith("c")])
-        fallbacks = (f"principal point held at the centre of the image: {_tilts_in_words(system)}",)
+        fallbacks = (f"the principal point is held at the centre of the image: {_tilts_in_words(system)}",)
         camera = fit.start.camera
         centred = fit.lens.camera(
             camera.width, camera.height, *camera.focal_lengths, camera.width / 2, camera.height / 2
@@ -384,6 +411,11 @@ def _determined(fit: _Fit, system: CalibrationSystem, summary: Summary) -> _Chec
         deviations = _deviations(system, summary, [names[k] for k in columns])
         focal = [d for name, d in deviations.items() if name.startswith("f")]
         mean = system.estimate.camera.mean_focal_length
+    elif between < _PARALLEL or one_axis:
+        fallbacks = (f"focal length and principal point rest on little: {_tilts_in_words(system)}",)
+    if _tilts(system.estimate.rotations)[1] < _FRONTAL:
+        # The focal length and all distances may grow together, whatever the noise makes of it.
+        return Rejected("undetermined_focal", _tilts_in_words(system))
     if not (max(focal) <= _OPEN_FOCAL * mean and mean < 20 * longer):
         return Rejected(
             "undetermined_focal", f"focal length {mean:.0f} ± {max(focal):.0f} px: {_tilts_in_words(system)}"
@@ -403,21 +435,28 @@ def _deviations(system: CalibrationSystem, summary: Summary, names: Sequence[str
     return dict(zip(names, np.sqrt(np.diag(inverse)[: len(names)] * max(noise, floor)).tolist(), strict=True))
 
 
+def _tilts(rotations: FloatArray) -> tuple[float, float, bool]:
+    """Largest angle between two boards, largest between a board and the image, radians; whether about one axis only."""
+    normals = rotations[:, :, 2]
+    tilts = np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1))
+    directions = (normals[:, :2] / np.maximum(np.linalg.norm(normals[:, :2], axis=1, keepdims=True), 1e-12))[
+        tilts > 0.1
+    ]
+    spread = np.linalg.svd(directions, compute_uv=False) if len(directions) > 1 else np.ones(2)
+    return largest_angle_between(normals), float(tilts.max()), bool(spread[-1] < 0.15 * spread[0])
+
+
 def _tilts_in_words(system: CalibrationSystem) -> str:
-    """How the boards stand to one another and to the image, in degrees."""
-    normals = system.estimate.rotations[:, :, 2]
-    between = np.rad2deg(largest_angle_between(normals))
-    axis = np.rad2deg(np.arccos(np.clip(np.abs(normals[:, 2]), 0, 1)))
-    directions = normals[:, :2] / np.maximum(np.linalg.norm(normals[:, :2], axis=1, keepdims=True), 1e-12)
-    spread = np.linalg.svd(directions[axis > 5.0], compute_uv=False) if np.sum(axis > 5.0) > 1 else np.array([1.0, 0])
-    views = f"all {len(normals)} views"
-    if axis.max() < 8.0:
-        return f"{views} within {axis.max():.0f} degrees of the image plane; tilt the board by 15 to 45 degrees"
-    if between < 8.0:
-        return f"{views} within {between:.0f} degrees of parallel; tilt the board by 15 to 45 degrees about two axes"
-    if spread[-1] < 0.2 * spread[0]:
+    """How the boards stand to one another and to the image, in degrees, and what would help."""
+    between, tilt, one_axis = _tilts(system.estimate.rotations)
+    views = f"all {len(system.observations)} views"
+    if tilt < _FRONTAL:
+        return f"{views} within {np.rad2deg(tilt):.0f}° of the image plane; tilt the board by 15° to 45° about two axes"
+    if between < _PARALLEL:
+        return f"{views} within {np.rad2deg(between):.0f}° of parallel; tilt the board by 15° to 45° about two axes"
+    if one_axis:
         return f"{views} are tilted about one axis only; tilt the board about the other one, too"
-    return f"tilts to {axis.max():.0f} degrees are too few or too alike; add views that fill the image"
+    return f"tilts up to {np.rad2deg(tilt):.0f}° are too few or too alike; add views that fill the image"
 
 
 def _result(

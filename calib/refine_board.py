@@ -22,7 +22,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from sfm.core.arrays import FloatArray, Value, Vector, readonly
+from sfm.core.arrays import BoolArray, FloatArray, Value, Vector, readonly
 from sfm.core.geometry.rotation import skew
 
 ShapeKind: TypeAlias = Literal["flat", "scale", "paraboloid", "height", "free"]
@@ -63,25 +63,25 @@ class BoardShape(Value):
         return float(np.ptp(self.displacements[:, 2])) if len(self.given) else 0.0
 
 
-def board_shape(kind: ShapeKind, points: FloatArray, seen: FloatArray | None = None) -> BoardShape:
+def board_shape(kind: ShapeKind, points: FloatArray, movable: BoolArray | None = None) -> BoardShape:
     """The undeformed board of a family.
 
     Args:
         points: (P, 3) as designed.
-        seen: (P,) how many views show each point; those that none shows do not move. All of them by default.
+        movable: (P,) points that enough views show; of the others' places photos tell nothing. All of them by default.
     Raises:
         ValueError: the family is unknown.
     """
     if kind not in SHAPES:
         raise ValueError(f"unknown board shape {kind!r}; known are {', '.join(SHAPES)}")
-    used = np.ones(len(points), bool) if seen is None else np.asarray(seen) > 0
+    used = np.ones(len(points), bool) if movable is None else movable
     basis = _basis(kind, points, used)
     return BoardShape(kind, readonly(points, (None, 3)), basis, np.zeros(basis.shape[2]))
 
 
 def _basis(kind: ShapeKind, points: FloatArray, used: np.ndarray) -> FloatArray:
     count = len(points)
-    if kind == "flat" or not count:
+    if kind == "flat" or not used.any():
         return np.zeros((count, 3, 0))
     low, high = points[used].min(0), points[used].max(0)
     center, reach = (low + high) / 2, np.maximum((high - low) / 2, 1e-300)

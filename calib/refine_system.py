@@ -186,7 +186,7 @@ class CalibrationSystem:
         """Makes the last trial current."""
         self._now, self._trial = self._trial, self._now
 
-    def _place(self, params: Vector, coefficients: Vector, R: FloatArray, t: FloatArray) -> _Point:
+    def _place(self, params: FloatArray, coefficients: FloatArray, R: FloatArray, t: FloatArray) -> _Point:
         views, width = len(self.observations), 7 + len(self._columns) + self._basis.shape[2]
         arrays = (np.array(params), np.array(coefficients), np.array(R), np.array(t))
         return _Point(*arrays, np.empty(views), np.empty((views, width, width)))
