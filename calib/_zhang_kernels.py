@@ -15,17 +15,18 @@ _FLOOR = 1e-3
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_homographies(offsets, rows, board, points, used, passes, homographies, errors):
+def fit_homographies(offsets, rows, board, points, used, passes, homographies, errors, spreads):
     """Fills the homographies (V, 3, 3), board (x, y, 1) → points, and their rms errors (V,); NaN where there is none.
 
-    Only observations that are `used` count. Beyond the first pass points have the weights of least absolute errors.
+    `spreads` (V,) become the root mean squared distances of points from their centroids. Only observations that are
+    `used` count. Beyond the first pass points have the weights of least absolute errors.
     """
     weights = np.ones(len(points))
     for view in range(len(offsets) - 1):
         first, last = offsets[view], offsets[view + 1]
         weights[first:last] = 1.0
         for _ in range(passes):
-            errors[view] = _fit_one(first, last, rows, board, points, used, weights, homographies[view])
+            errors[view], spreads[view] = _fit_one(first, last, rows, board, points, used, weights, homographies[view])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -47,13 +48,13 @@ def poses_from_rays(offsets, rows, board, rays, used, passes, rotations, transla
                 seen[n, k] = along / z if ahead[n] else 0.0
         weights[first:last] = 1.0
         for _ in range(passes):
-            errors[view] = _fit_one(first, last, rows, board, seen, ahead, weights, h)
+            errors[view], _ = _fit_one(first, last, rows, board, seen, ahead, weights, h)
         _pose(h, frame, rotations[view], translations[view])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fit_one(first, last, rows, board, points, used, weights, h):
-    """Normalised linear fit with h33 = 1 about the centroids; returns the rms error and renews the weights."""
+    """Normalised linear fit with h33 = 1 about the centroids: (rms error, spread of the points); renews the weights."""
     count, cx, cy, cu, cv = 0, 0.0, 0.0, 0.0, 0.0
     for n in range(first, last):
         if used[n]:
@@ -62,7 +63,7 @@ def _fit_one(first, last, rows, board, points, used, weights, h):
             cx, cy, cu, cv = cx + board[p, 0], cy + board[p, 1], cu + points[n, 0], cv + points[n, 1]
     h[:] = math.nan
     if count < 4:
-        return math.nan
+        return math.nan, math.nan
     cx, cy, cu, cv = cx / count, cy / count, cu / count, cv / count
     board_spread, image_spread = 0.0, 0.0
     for n in range(first, last):
@@ -83,8 +84,9 @@ def _fit_one(first, last, rows, board, points, used, weights, h):
         for i in range(9):
             for j in range(i + 1):
                 normal[i, j] += w * (row_u[i] * row_u[j] + row_v[i] * row_v[j])
+    spread = math.sqrt(image_spread / count)
     if not _solve8(normal):
-        return math.nan
+        return math.nan, spread
     g = normal[8]
     error = _errors(first, last, rows, board, points, used, a, b, cx, cy, cu, cv, g, weights)
     # h = T_image⁻¹ G T_board
@@ -94,7 +96,7 @@ def _fit_one(first, last, rows, board, points, used, weights, h):
     h[0, 0], h[0, 1], h[0, 2] = g0 / b + cu * g6, g1 / b + cu * g7, g2 / b + cu * g8
     h[1, 0], h[1, 1], h[1, 2] = g3 / b + cv * g6, g4 / b + cv * g7, g5 / b + cv * g8
     h[2, 0], h[2, 1], h[2, 2] = g6, g7, g8
-    return math.sqrt(error / count) / b
+    return math.sqrt(error / count) / b, spread
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

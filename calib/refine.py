@@ -214,7 +214,7 @@ def sort_out(
     observations = gather(board, usable)
     found = fit_view_homographies(observations)
     H, errors = found.matrices, found.errors
-    flat, limits = np.isfinite(errors), _NOT_A_BOARD * _spreads(observations)
+    flat, limits = np.isfinite(errors), _NOT_A_BOARD * found.spreads
     fits = flat & (errors <= limits)
     for v in np.flatnonzero(flat & ~fits) if config.reject else ():
         # Single corners may be far off: most of them must fit.
@@ -233,7 +233,7 @@ def sort_out(
     if np.all(fits & alike):
         return observations, found, rejected
     kept = np.flatnonzero(fits & alike).tolist()
-    return observations.of_views(kept), Homographies(H[kept], errors[kept]), rejected
+    return observations.of_views(kept), Homographies(H[kept], errors[kept], found.spreads[kept]), rejected
 
 
 def _why_not(flat: bool, fits: bool, error: float) -> tuple[str, str]:
@@ -243,14 +243,6 @@ def _why_not(flat: bool, fits: bool, error: float) -> tuple[str, str]:
         detail = f"{error:.1f} px from a flat board: corners in a wrong order, or rows and columns swapped"
         return "not_this_board", detail
     return "mirrored", "corners run the other way round than in most views"
-
-
-def _spreads(observations: Observations) -> Vector:
-    """(V,) root of the mean squared distance of a view's corners from their mean, px."""
-    counts, view = np.diff(observations.offsets), observations.view_of
-    means = np.stack([np.bincount(view, observations.points2D[:, k]) / counts for k in range(2)], 1)
-    squares = np.sum((observations.points2D - means[view]) ** 2, axis=1)
-    return np.sqrt(np.bincount(view, squares) / counts)
 
 
 def _told(count: int, needed: int, rejected: Sequence[RejectedView]) -> str:

@@ -64,21 +64,25 @@ class Start(Value):
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Homographies(Value):
-    """(V, 3, 3) board → px, positive at the board's centre; NaN where a view has none; and rms errors (V,) in px."""
+    """(V, 3, 3) board → px, positive at the board's centre; NaN where a view has none; and rms errors (V,) in px.
+
+    `spreads` (V,) are the root mean squared distances of a view's corners from their mean, px.
+    """
 
     matrices: FloatArray
     errors: Vector
+    spreads: Vector
 
 
 def fit_view_homographies(observations: Observations, *, robust: bool = False) -> Homographies:
     """The homography of each view; robust ones minimise about the sum of absolute errors."""
     count = len(observations)
-    matrices, errors = np.empty((count, 3, 3)), np.empty(count)
+    matrices, errors, spreads = np.empty((count, 3, 3)), np.empty(count), np.empty(count)
     kernels.fit_homographies(
         observations.offsets, observations.rows, observations.board, observations.points2D,
-        np.ones(len(observations.rows), bool), _ROBUST_PASSES if robust else 1, matrices, errors,
+        np.ones(len(observations.rows), bool), _ROBUST_PASSES if robust else 1, matrices, errors, spreads,
     )  # fmt: skip
-    return Homographies(matrices, errors)
+    return Homographies(matrices, errors, spreads)
 
 
 def find_start(
