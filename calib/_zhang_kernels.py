@@ -72,18 +72,22 @@ def _fit_one(first, last, rows, board, points, used, weights, h):
             board_spread += (board[p, 0] - cx) ** 2 + (board[p, 1] - cy) ** 2
             image_spread += (points[n, 0] - cu) ** 2 + (points[n, 1] - cv) ** 2
     a, b = math.sqrt(2.0 * count / board_spread), math.sqrt(2.0 * count / image_spread)
-    normal = np.zeros((9, 9))
-    row_u, row_v = np.zeros(9), np.zeros(9)
+    # Sums of (1, u, v, u² + v²) times the products xx, xy, x, yy, y, 1.
+    sums = np.zeros((4, 6))
     for n in range(first, last):
         if not used[n]:
             continue
         p, w = rows[n], weights[n]
         x, y, u, v = a * (board[p, 0] - cx), a * (board[p, 1] - cy), b * (points[n, 0] - cu), b * (points[n, 1] - cv)
-        row_u[0], row_u[1], row_u[2], row_u[6], row_u[7], row_u[8] = x, y, 1.0, -u * x, -u * y, u
-        row_v[3], row_v[4], row_v[5], row_v[6], row_v[7], row_v[8] = x, y, 1.0, -v * x, -v * y, v
-        for i in range(9):
-            for j in range(i + 1):
-                normal[i, j] += w * (row_u[i] * row_u[j] + row_v[i] * row_v[j])
+        for k, factor in enumerate((w, w * u, w * v, w * (u * u + v * v))):
+            sums[k, 0] += factor * x * x
+            sums[k, 1] += factor * x * y
+            sums[k, 2] += factor * x
+            sums[k, 3] += factor * y * y
+            sums[k, 4] += factor * y
+            sums[k, 5] += factor
+    normal = np.zeros((9, 9))
+    _fill_normal(sums, normal)
     spread = math.sqrt(image_spread / count)
     if not _solve8(normal):
         return math.nan, spread
@@ -97,6 +101,22 @@ def _fit_one(first, last, rows, board, points, used, weights, h):
     h[1, 0], h[1, 1], h[1, 2] = g3 / b + cv * g6, g4 / b + cv * g7, g5 / b + cv * g8
     h[2, 0], h[2, 1], h[2, 2] = g6, g7, g8
     return math.sqrt(error / count) / b, spread
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_normal(sums, normal):
+    """The lower triangle for the rows (x, y, 1, 0, 0, 0, −ux, −uy | u) and (0, 0, 0, x, y, 1, −vx, −vy | v)."""
+    at = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
+    for i in range(3):
+        for j in range(3):
+            k = at[i][j]
+            if j <= i:
+                normal[i, j] = normal[3 + i, 3 + j] = sums[0, k]
+            # The right-hand side has the sign of u itself.
+            sign = 1.0 if i == 2 else -1.0
+            normal[6 + i, j], normal[6 + i, 3 + j] = sign * sums[1, k], sign * sums[2, k]
+            if j <= i:
+                normal[6 + i, 6 + j] = sums[3, k] * (-1.0 if i == 2 and j < 2 else 1.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

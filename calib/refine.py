@@ -74,7 +74,7 @@ class CalibrationConfig:
     keep_within_sigma: float = 4.0
     """What rejection then cuts at; as mrcal does."""
     max_iterations: int = 500
-    relative_cost_tolerance: float = 1e-13
+    relative_cost_tolerance: float = 1e-12
     """Close to rounding, so that nothing is left of the way there."""
     keep_invertible: bool = True
     """No corner may lie where the distortion turns back. A rational polynomial can fit a little better otherwise."""

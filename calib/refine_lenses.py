@@ -9,6 +9,7 @@
 | opencv8 | FULL_OPENCV | and k4, k5, k6: OpenCV's rational model |
 | fisheye | OPENCV_FISHEYE | k1 … k4 of Kannala and Brandt |
 | eucm | EUCM | α, β of the enhanced unified model |
+| division | EUCM, α = ½ | β = −4 k of the division model, a ray ∝ (a, b, 1 + k (a² + b²)) |
 
 Parameters that are released together at first shape the image most; a rational function from zero in one step is led
 astray by noise.
@@ -74,6 +75,7 @@ LENSES: tuple[Lens, ...] = (
     Lens("opencv8", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"), ("k4", "k5", "k6"))),
     Lens("fisheye", "OPENCV_FISHEYE", (_FXY, (*_C, "k1", "k2"), ("k3", "k4")), start="wide"),
     Lens("eucm", "EUCM", (_FXY, (*_C, "alpha", "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
+    Lens("division", "EUCM", (_FXY, (*_C, "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
 )
 
 _BY_NAME = {lens.name: lens for lens in LENSES}

@@ -221,7 +221,9 @@ def _common_corners(
         elif best is None or found.sigma_px < best.sigma_px:
             best = found
     if best is None:
-        return Rejected("no_lens", f"{first.reason}: {first.detail}" if first is not None else "no lens models were asked for")
+        return Rejected(
+            "no_lens", f"{first.reason}: {first.detail}" if first is not None else "no lens models were asked for"
+        )
     return views_of(best.observations)
 
 

@@ -49,7 +49,7 @@ _TRIALS = np.geomspace(0.15, 6.0, 24)
 """Focal lengths over the longer side that are tried: steps of 17 %."""
 _VIEWS_TRIED = 12
 _ROBUST_PASSES = 12
-_ENOUGH = 12
+_ENOUGH = 9
 """Corners that a first pose is taken from."""
 
 

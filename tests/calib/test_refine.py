@@ -10,6 +10,7 @@ import pytest
 
 from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_views import BoardView
+from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -306,3 +307,15 @@ def test_mistakes_of_the_caller_are_told(rng):
         BoardView("v", 10, 10, np.zeros(2, np.int64), np.zeros((2, 2)))
     with pytest.raises(ValueError, match="positive definite"):
         BoardView("v", 10, 10, np.arange(1), np.zeros((1, 2)), np.zeros((1, 2, 2)))
+
+
+def test_the_division_model_is_the_unified_one_with_half(rng):
+    camera = Camera("EUCM", 1280, 960, np.array([700.0, 698.0, 634.0, 485.0, 0.5, 0.8]))
+    pixels = rng.uniform(0, 1, (50, 2)) * [1280, 960]
+    rays, _ = camera.unproject(pixels)
+    a, b = ((pixels - [634.0, 485.0]) / [700.0, 698.0]).T
+    divided = np.stack([a, b, 1 - 0.8 / 4 * (a * a + b * b)], 1)
+    np.testing.assert_allclose(rays, divided / np.linalg.norm(divided, axis=1, keepdims=True), atol=1e-12)
+    found = calibrated(views_of(camera, rng, noise_px=0.0), CalibrationConfig(lens="division"))
+    np.testing.assert_allclose(found.camera.params, camera.params, rtol=1e-6)
+    assert "alpha" not in found.free_names
