@@ -42,6 +42,8 @@ _OPEN_FOCAL = 0.1
 """Standard deviation of a focal length over itself, beyond which it is not determined."""
 _OPEN_CENTER = 0.1
 """Standard deviation of the principal point over the longer side, beyond which it is not determined."""
+_SUSPICIOUS = 2.0
+"""Times the median error of views beyond which the other pose of a plane is tried."""
 _ROUNDS = 8
 _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
@@ -50,6 +52,7 @@ _CONVERGED, _EXACT = 1e-9, 1e-20
 _FRONTAL, _PARALLEL = math.radians(3.0), math.radians(6.0)
 """Angles of boards to the image and to one another below which they are as good as none."""
 _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
+_SEEDED = StopRules(max_iterations=60, relative_cost_tolerance=1e-7, gradient_tolerance=0.0)
 _ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
 
 
@@ -177,6 +180,9 @@ def calibrate(
     if isinstance(estimate, Rejected):
         return estimate
     system, summary = fit.solve(observations, estimate)
+    turned = _turned_back(fit, system)
+    if turned is not None:
+        system, summary = fit.solve(observations, turned)
     corners: list[tuple[str, int]] = []
     if config.reject:
         system, summary, more = _reject(fit, system, summary, corners)
@@ -272,8 +278,11 @@ class _Fit:
             last = stage == len(self.lens.stages)
             if last and len(some) == views:
                 break
-            system = self.system(seeds, estimate, stage, "cauchy" if gross else "trivial", 2.0, shaped=False)
-            minimize(system, _ROUGH)
+            # The last stage runs on seeds only where they stand for many views, and then saves steps with all.
+            rules, caution = (_SEEDED, _NEAR) if last and not gross else (_ROUGH, 1.0)
+            loss: Loss = "cauchy" if gross else "trivial"
+            system = self.system(seeds, estimate, stage, loss, 2.0, shaped=False, caution=caution)
+            minimize(system, rules)
             estimate = system.estimate
         return estimate if len(some) == views else self.placed(observations, estimate.camera, gross)
 
@@ -311,6 +320,37 @@ class _Fit:
             gradient_tolerance=0.0,
         )
         return system, minimize(system, rules)
+
+
+def _turned_back(fit: _Fit, system: CalibrationSystem) -> Estimate | None:
+    """The estimate with other poses for bad views that fit better tilted the other way; None where none does.
+
+    Seen from afar, a plane tilted away to the left looks nearly like one tilted to the right: with v the line of sight
+    to its middle, R_v(180°) R R_z(180°) keeps what lies across v and turns round what lies along it. Either is a
+    minimum of the pose alone, and noise may have led to the wrong one.
+    """
+    observations, costs = system.observations, system.view_costs / np.diff(system.observations.offsets)
+    bad = np.flatnonzero(costs > _SUSPICIOUS**2 * np.median(costs)).tolist()
+    if not bad:
+        return None
+    views, now = observations.of_views(bad), system.estimate
+    R, t = now.rotations.copy(), now.translations.copy()
+    for v in bad:
+        middle = observations.board[observations.rows[observations.offsets[v] : observations.offsets[v + 1]]].mean(0)
+        there = R[v] @ middle + t[v]
+        sight = there / np.linalg.norm(there)
+        R[v] = (2 * np.outer(sight, sight) - np.eye(3)) @ R[v] * [-1.0, -1.0, 1.0]
+        t[v] = there - R[v] @ middle
+    other = dataclasses.replace(now, rotations=R, translations=t).of_views(bad)
+    trial = fit.system(views, other, shaped=False, columns=np.zeros(0, np.int64))
+    minimize(trial, _ROBUST)
+    better = trial.view_costs < system.view_costs[bad]
+    if not np.any(better):
+        return None
+    R, t = now.rotations.copy(), now.translations.copy()
+    at = np.array(bad)[better]
+    R[at], t[at] = trial.estimate.rotations[better], trial.estimate.translations[better]
+    return dataclasses.replace(now, rotations=R, translations=t)
 
 
 def _lengths(system: CalibrationSystem) -> Vector:

@@ -170,8 +170,8 @@ def choose_lens(
 ) -> tuple[RankedLens, ...] | Rejected:  # fmt: skip
     """Lens models ranked by the error of held-out views, the chosen one first.
 
-    The chosen one has the fewest coefficients of those whose error is within a standard error of the least one. Corners
-    that the richest fitting model leaves out are left out for all, so that all are judged by the same.
+    The chosen one has the fewest coefficients of those that converged to an error within a standard error of the least.
+    Corners that the best fitting model leaves out are left out for all, so that all are judged by the same.
 
     Returns:
         `no_lens` where no model can be calibrated, with the reason of the first.
@@ -239,6 +239,7 @@ def _ranked(rows: list[RankedLens], held: dict[str, HeldOut]) -> tuple[RankedLen
         judged.append(dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error))
     able = [row for row in judged if row.lens in held]
     alike = [row for row in able if row.excess <= row.excess_error]
+    alike = [row for row in alike if row.converged] or alike
     chosen = min(alike, key=lambda row: (row.coefficients, row.held_out_rms_px))
     rest = sorted(
         (row for row in judged if row is not chosen), key=lambda row: (bool(row.refused), row.held_out_rms_px)

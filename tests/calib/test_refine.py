@@ -319,3 +319,21 @@ def test_the_division_model_is_the_unified_one_with_half(rng):
     found = calibrated(views_of(camera, rng, noise_px=0.0), CalibrationConfig(lens="division"))
     np.testing.assert_allclose(found.camera.params, camera.params, rtol=1e-6)
     assert "alpha" not in found.free_names
+
+
+def test_a_view_that_is_tilted_the_wrong_way_is_turned_back(rng):
+    from calib.refine import _Fit, _turned_back
+    from calib.refine_lenses import lens_by_name
+    from calib.refine_system import CalibrationSystem
+    from calib.zhang import Start
+
+    found = calibrated(views_of(LENS, rng))
+    R, t = found.estimate.rotations.copy(), found.estimate.translations.copy()
+    sight = t[5] / np.linalg.norm(t[5])  # the board's middle is its origin
+    R[5] = (2 * np.outer(sight, sight) - np.eye(3)) @ R[5] @ np.diag([-1.0, -1.0, 1.0])
+    flipped = dataclasses.replace(found.estimate, rotations=R)
+    system = CalibrationSystem(found.observations, flipped, found.columns)
+    turned = _turned_back(_Fit(lens_by_name("opencv4"), ALL, Start(found.camera, "given"), found.shape), system)
+    assert turned is not None
+    np.testing.assert_allclose(turned.rotations, found.estimate.rotations, atol=1e-3)
+    np.testing.assert_allclose(turned.translations, found.estimate.translations, atol=1e-4)
