@@ -322,7 +322,7 @@ def test_the_division_model_is_the_unified_one_with_half(rng):
 
 
 def test_a_view_that_is_tilted_the_wrong_way_is_turned_back(rng):
-    from calib.refine import _Fit, _turned_back
+    from calib.refine_fit import Fit, turned_back
     from calib.refine_lenses import lens_by_name
     from calib.refine_system import CalibrationSystem
     from calib.zhang import Start
@@ -333,7 +333,7 @@ def test_a_view_that_is_tilted_the_wrong_way_is_turned_back(rng):
     R[5] = (2 * np.outer(sight, sight) - np.eye(3)) @ R[5] @ np.diag([-1.0, -1.0, 1.0])
     flipped = dataclasses.replace(found.estimate, rotations=R)
     system = CalibrationSystem(found.observations, flipped, found.columns)
-    turned = _turned_back(_Fit(lens_by_name("opencv4"), ALL, Start(found.camera, "given"), found.shape), system)
+    turned = turned_back(Fit(lens_by_name("opencv4"), ALL, Start(found.camera, "given"), found.shape), system)
     assert turned is not None
     np.testing.assert_allclose(turned.rotations, found.estimate.rotations, atol=1e-3)
     np.testing.assert_allclose(turned.translations, found.estimate.translations, atol=1e-4)
