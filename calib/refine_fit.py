@@ -1,0 +1,154 @@
+"""One way to fit a calibration: start, release of parameters in stages, the end, and planes tilted the wrong way."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from calib.refine_board import BoardShape, ShapeKind
+from calib.refine_lenses import Lens
+from calib.refine_system import CalibrationSystem, Estimate
+from calib.refine_views import Observations
+from calib.zhang import Start, poses_of_views
+from sfm.core.arrays import Vector
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
+from sfm.core.optim.losses import Loss
+
+_GROSS = 6.0
+"""Worst homography over the median one, beyond which single corners are suspected of being far off."""
+_SEED_VIEWS = 14
+_SUSPICIOUS = 2.0
+"""Times the median error of views beyond which the other pose of a plane is tried."""
+_NEAR = 1e-6
+"""Damping near the minimum over the usual one."""
+_ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
+_SEEDED = StopRules(max_iterations=60, relative_cost_tolerance=1e-7, gradient_tolerance=0.0)
+ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationConfig:
+    """How a camera is calibrated."""
+
+    lens: str = "opencv5"
+    """Row of `refine_lenses.LENSES`."""
+    shape: ShapeKind = "flat"
+    """What the board may be; see `refine_board`."""
+    focal_px: float | None = None
+    """First guess where it is known; it is refined."""
+    reject: bool = True
+    """Leave out corners and views that do not fit."""
+    min_views: int = 3
+    """Below it one bad view could not be told."""
+    min_corners: int = 6
+    """In a view; a homography takes 4 and says nothing of their quality."""
+    reject_beyond_sigma: float = 5.0
+    """A corner farther off starts the rejection; one of 270 000 right ones is."""
+    keep_within_sigma: float = 4.0
+    """What rejection then cuts at; as mrcal does."""
+    max_iterations: int = 500
+    relative_cost_tolerance: float = 1e-12
+    """Close to rounding, so that nothing is left of the way there."""
+    keep_invertible: bool = True
+    """No corner may lie where the distortion turns back. A rational polynomial can fit a little better otherwise."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """One way to fit: what does not change between the attempts."""
+
+    lens: Lens
+    config: CalibrationConfig
+    start: Start
+    shape: BoardShape
+
+    def seed(self, observations: Observations, errors: Vector) -> Estimate | Rejected:
+        """Camera and poses by releasing parameters in stages, on some of the views where there are many."""
+        views = len(observations)
+        some = sorted(set(np.linspace(0, views - 1, min(views, _SEED_VIEWS)).astype(int).tolist()))
+        seeds = observations if len(some) == views else observations.of_views(some)
+        gross = self.config.reject and bool(np.isinf(errors).any() or errors.max() > _GROSS * np.median(errors))
+        estimate = self.placed(seeds, self.start.camera, gross)
+        if isinstance(estimate, Rejected):
+            return estimate
+        for stage in range(1, len(self.lens.stages) + 1):
+            last = stage == len(self.lens.stages)
+            if last and len(some) == views:
+                break
+            # The last stage runs on seeds only where they stand for many views, and then saves steps with all.
+            rules, caution = (_SEEDED, _NEAR) if last and not gross else (_ROUGH, 1.0)
+            loss: Loss = "cauchy" if gross else "trivial"
+            system = self.system(seeds, estimate, stage, loss, 2.0, shaped=False, caution=caution)
+            minimize(system, rules)
+            estimate = system.estimate
+        return estimate if len(some) == views else self.placed(observations, estimate.camera, gross)
+
+    def placed(self, observations: Observations, camera: Camera, robust: bool) -> Estimate | Rejected:
+        """All views with this camera, in closed form."""
+        R, t, errors = poses_of_views(observations, camera, robust=robust)
+        lost = np.flatnonzero(~np.isfinite(errors) | ~np.isfinite(t).all(1))
+        if len(lost):
+            return Rejected("no_solution", f"{observations.names[lost[0]]} has no pose with the first camera")
+        return Estimate(camera, R, t, self.shape)
+
+    def system(
+        self, observations: Observations, estimate: Estimate, stages: int | None = None, loss: Loss = "trivial",
+        scale: float = 1.0, shaped: bool = True, columns: np.ndarray | None = None, caution: float = 1.0,
+    ) -> CalibrationSystem:  # fmt: skip
+        """The problem from here, with what the first so many stages release, or these columns."""
+        return CalibrationSystem(
+            observations,
+            estimate,
+            self.lens.columns(stages) if columns is None else columns,
+            free_shape=shaped and self.shape.basis.shape[2] > 0,
+            loss=loss,
+            loss_scale=scale,
+            keep_invertible=self.config.keep_invertible,
+            caution=caution,
+        )
+
+    def solve(
+        self, observations: Observations, estimate: Estimate, columns: np.ndarray | None = None
+    ) -> tuple[CalibrationSystem, Summary]:
+        """Least squares, to the end."""
+        system = self.system(observations, estimate, columns=columns, caution=_NEAR)
+        rules = StopRules(
+            max_iterations=self.config.max_iterations,
+            relative_cost_tolerance=self.config.relative_cost_tolerance,
+            gradient_tolerance=0.0,
+        )
+        return system, minimize(system, rules)
+
+
+def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:
+    """The estimate with other poses for bad views that fit better tilted the other way; None where none does.
+
+    Seen from afar, a plane tilted away to the left looks nearly like one tilted to the right: with v the line of sight
+    to its middle, R_v(180°) R R_z(180°) keeps what lies across v and turns round what lies along it. Either is a
+    minimum of the pose alone, and noise may have led to the wrong one.
+    """
+    observations, costs = system.observations, system.view_costs / np.diff(system.observations.offsets)
+    bad = np.flatnonzero(costs > _SUSPICIOUS**2 * np.median(costs)).tolist()
+    if not bad:
+        return None
+    views, now = observations.of_views(bad), system.estimate
+    R, t = now.rotations.copy(), now.translations.copy()
+    for v in bad:
+        middle = observations.board[observations.rows[observations.offsets[v] : observations.offsets[v + 1]]].mean(0)
+        there = R[v] @ middle + t[v]
+        sight = there / np.linalg.norm(there)
+        R[v] = (2 * np.outer(sight, sight) - np.eye(3)) @ R[v] * [-1.0, -1.0, 1.0]
+        t[v] = there - R[v] @ middle
+    other = dataclasses.replace(now, rotations=R, translations=t).of_views(bad)
+    trial = fit.system(views, other, shaped=False, columns=np.zeros(0, np.int64))
+    minimize(trial, ROBUST)
+    better = trial.view_costs < system.view_costs[bad]
+    if not np.any(better):
+        return None
+    R, t = now.rotations.copy(), now.translations.copy()
+    at = np.array(bad)[better]
+    R[at], t[at] = trial.estimate.rotations[better], trial.estimate.translations[better]
+    return dataclasses.replace(now, rotations=R, translations=t)

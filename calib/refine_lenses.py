@@ -1,0 +1,92 @@
+"""The lens models that calibration offers, and in which order their parameters are released.
+
+| name | model of the camera | coefficients |
+|---|---|---|
+| pinhole | PINHOLE | none |
+| simple_radial, radial | SIMPLE_RADIAL, RADIAL | k; k1, k2, with one focal length |
+| opencv4 | OPENCV | k1, k2, p1, p2 |
+| opencv5 | FULL_OPENCV, k4 = k5 = k6 = 0 | and k3: OpenCV's default |
+| opencv8 | FULL_OPENCV | and k4, k5, k6: OpenCV's rational model |
+| fisheye | OPENCV_FISHEYE | k1 … k4 of Kannala and Brandt |
+| eucm | EUCM | α, β of the enhanced unified model |
+| division | EUCM, α = ½ | β = −4 k of the division model, a ray ∝ (a, b, 1 + k (a² + b²)) |
+
+Parameters that are released together at first shape the image most; a rational function from zero in one step is led
+astray by noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal
+
+import numpy as np
+
+from sfm.core.arrays import Vector
+from sfm.core.cameras import Camera, model_by_name
+from sfm.core.cameras.priors import infer_camera
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Lens:
+    """One row of the table.
+
+    Attributes:
+        model: name of the camera model.
+        stages: names of the parameters that each stage releases; what none names stays as it starts.
+        start: "perspective" is found by Zhang's closed form, "wide" by trying focal lengths.
+        shape: start of parameters that do not start at zero.
+    """
+
+    name: str
+    model: str
+    stages: tuple[tuple[str, ...], ...]
+    start: Literal["perspective", "wide"] = "perspective"
+    shape: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Everything that is estimated, in the model's order."""
+        free = {name for stage in self.stages for name in stage}
+        return tuple(name for name in model_by_name(self.model).param_names if name in free)
+
+    def columns(self, stages: int | None = None) -> np.ndarray:
+        """Positions of the parameters that the first so many stages release; all of them by default."""
+        free = {name for stage in self.stages[:stages] for name in stage}
+        return np.flatnonzero([name in free for name in model_by_name(self.model).param_names])
+
+    def camera(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
+        """The camera with these focal lengths and principal point, px, and no distortion."""
+        camera = infer_camera(self.model, width, height)
+        values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **dict(self.shape)}
+        names = camera.model_info.param_names
+        params: Vector = np.array([values.get(name, old) for name, old in zip(names, camera.params, strict=True)])
+        return camera.with_params(params)
+
+
+_F, _FXY, _C = ("f",), ("fx", "fy"), ("cx", "cy")
+
+LENSES: tuple[Lens, ...] = (
+    Lens("pinhole", "PINHOLE", ((*_FXY, *_C),)),
+    Lens("simple_radial", "SIMPLE_RADIAL", ((*_F, *_C, "k"),)),
+    Lens("radial", "RADIAL", ((*_F, *_C, "k1", "k2"),)),
+    Lens("opencv4", "OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2"))),
+    Lens("opencv5", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"))),
+    Lens("opencv8", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"), ("k4", "k5", "k6"))),
+    Lens("fisheye", "OPENCV_FISHEYE", (_FXY, (*_C, "k1", "k2"), ("k3", "k4")), start="wide"),
+    Lens("eucm", "EUCM", (_FXY, (*_C, "alpha", "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
+    Lens("division", "EUCM", (_FXY, (*_C, "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
+)
+
+_BY_NAME = {lens.name: lens for lens in LENSES}
+
+
+def lens_by_name(name: str) -> Lens:
+    """The row of the table called `name`.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in _BY_NAME:
+        raise ValueError(f"unknown lens model {name!r}; known are {', '.join(_BY_NAME)}")
+    return _BY_NAME[name]

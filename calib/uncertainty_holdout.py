@@ -1,0 +1,278 @@
+"""What a calibration says of photos that it has not seen, and which lens model says it best.
+
+The residuals of a fit tell little of the next photo: every coefficient lowers them, and those of one view share their
+errors. So views are held out: the camera and the board come from the others, and of a held-out view only its pose is
+fitted. Its error is as free of the camera's own fit as a calibration in use.
+
+    fold k holds out views k, k + K, k + 2K … of a random order; every view is held out once
+
+Two lens models are compared view by view, so that what they share cancels; the better one is no better if the mean of
+the differences is within its standard error, and then the one with fewer coefficients is preferred.
+
+`split_half` asks the other way round: how far do the cameras of two halves of the views differ? By how many pixels is
+measured over the image, with frames aligned.
+
+Reference:
+    Hastie, Tibshirani & Friedman, The Elements of Statistical Learning, 2nd ed. 2009, §7.10 (one standard error).
+    Kogan, mrcal, Cross-validation (documentation).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.refine import Calibration, CalibrationConfig, calibrate
+from calib.refine_lenses import lens_by_name
+from calib.refine_system import CalibrationSystem, Estimate
+from calib.refine_views import BoardView, Observations
+from calib.uncertainty import pixel_grid, projection_difference
+from calib.zhang import poses_of_views
+from sfm.core.arrays import Points3D, Value, Vector
+from sfm.core.errors import Rejected
+from sfm.core.optim.levenberg_marquardt import StopRules, minimize
+
+_POSES = StopRules(max_iterations=50, relative_cost_tolerance=1e-10, gradient_tolerance=0.0)
+CANDIDATES = ("pinhole", "simple_radial", "radial", "opencv4", "opencv5", "opencv8", "fisheye", "eucm")
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class HeldOut(Value):
+    """Errors of views that were held out.
+
+    Attributes:
+        names: of the views.
+        squares: (V,) mean squared length of a view's residuals, px²; inf where the camera sees no pose for it.
+        counts: (V,) corners.
+        training_rms_px: of the fits, over all folds.
+    """
+
+    names: tuple[str, ...]
+    squares: Vector
+    counts: Vector
+    training_rms_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Over all corners, to compare with `Calibration.rms_px`."""
+        return math.sqrt(float(self.squares @ self.counts / self.counts.sum()))
+
+
+def hold_out(
+    board: Points3D, found: Calibration, config: CalibrationConfig, *, folds: int = 5, rng: np.random.Generator
+) -> HeldOut | Rejected:
+    """Errors of the views of a calibration, each held out once, at the corners that it kept.
+
+    Args:
+        folds: as many as views leaves out one at a time.
+    Returns:
+        `too_few_views` where the folds leave too few to calibrate from, or what such a calibration was refused for.
+    """
+    views = views_of(found.observations)
+    folds = min(folds, len(views))
+    order = rng.permutation(len(views))
+    squares, trained = np.empty(len(views)), []
+    plain = dataclasses.replace(config, reject=False)
+    for fold in range(folds):
+        held = sorted(order[fold::folds].tolist())
+        kept = sorted(set(range(len(views))) - set(held))
+        fit = calibrate(board, [views[v] for v in kept], plain)
+        if isinstance(fit, Rejected):
+            return fit
+        trained.append(fit.rms_px)
+        squares[held] = pose_only_errors(fit, found.observations.of_views(held))
+    return HeldOut(
+        names=found.observations.names,
+        squares=squares,
+        counts=np.diff(found.observations.offsets).astype(float),
+        training_rms_px=math.sqrt(float(np.mean(np.square(trained)))),
+    )
+
+
+def pose_only_errors(found: Calibration, observations: Observations) -> Vector:
+    """(V,) mean squared length of residuals in px² with this camera and board, each view's pose fitted to it."""
+    R, t, errors = poses_of_views(observations, found.camera)
+    out = np.full(len(observations), np.inf)
+    seen = np.flatnonzero(np.isfinite(errors) & np.isfinite(t).all(1)).tolist()
+    if not seen:
+        return out
+    some = observations.of_views(seen)
+    system = CalibrationSystem(some, Estimate(found.camera, R[seen], t[seen], found.shape), np.zeros(0, np.int64))
+    minimize(system, _POSES)
+    lengths = np.sum(system.residuals() ** 2, axis=1)
+    sums = np.bincount(some.view_of, np.where(np.isfinite(lengths), lengths, np.inf), len(some))
+    out[seen] = sums / np.diff(some.offsets)
+    return out
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class SplitHalf(Value):
+    """How much the cameras of two halves of the views differ over the image, px, with frames aligned."""
+
+    rms_px: float
+    worst_px: float
+
+
+def split_half(
+    board: Points3D, found: Calibration, config: CalibrationConfig, *, rng: np.random.Generator
+) -> SplitHalf | Rejected:
+    """Calibrates from each half of the views, by chance, and compares; half as many views err √2 times as much.
+
+    Returns:
+        what one of the halves was refused for.
+    """
+    views = views_of(found.observations)
+    order = rng.permutation(len(views))
+    plain, halves = dataclasses.replace(config, reject=False), []
+    for side in range(2):
+        half = calibrate(board, [views[v] for v in sorted(order[side::2].tolist())], plain)
+        if isinstance(half, Rejected):
+            return half
+        halves.append(half.camera)
+    pixels, _ = pixel_grid(found.camera, 24)
+    lengths = np.linalg.norm(projection_difference(halves[0], halves[1], pixels), axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    if not len(lengths):
+        return Rejected("no_common_pixels", "the two cameras see nothing in common")
+    return SplitHalf(math.sqrt(float(np.mean(lengths**2))), float(lengths.max()))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RankedLens(Value):
+    """A lens model among others.
+
+    Attributes:
+        held_out_rms_px: error of views that were held out.
+        excess, excess_error: mean over views of the squared error less that of the best model, px², and its standard
+            error.
+        differs_px: rms over the image of the difference to the chosen model, frames aligned.
+        refused: why there is no such calibration; then the rest is NaN.
+    """
+
+    lens: str
+    coefficients: int
+    held_out_rms_px: float = math.nan
+    rms_px: float = math.nan
+    excess: float = math.nan
+    excess_error: float = math.nan
+    differs_px: float = math.nan
+    converged: bool = False
+    refused: str = ""
+    calibration: Calibration | None = None
+
+
+def choose_lens(
+    board: Points3D, views: Sequence[BoardView], config: CalibrationConfig = CalibrationConfig(), *,
+    lenses: Sequence[str] = CANDIDATES, folds: int = 5, seed: int = 0,
+) -> tuple[RankedLens, ...] | Rejected:  # fmt: skip
+    """Lens models ranked by the error of held-out views, the chosen one first.
+
+    The chosen one has the fewest coefficients of those that converged to an error within a standard error of the least.
+    Corners that the best fitting model leaves out are left out for all, so that all are judged by the same.
+
+    Returns:
+        `no_lens` where no model can be calibrated, with the reason of the first.
+    """
+    rows: list[RankedLens] = []
+    squares: dict[str, HeldOut] = {}
+    common = _common_corners(board, views, config, lenses)
+    if isinstance(common, Rejected):
+        return common
+    for name in lenses:
+        one = dataclasses.replace(config, lens=name, reject=False)
+        row = RankedLens(name, len(lens_by_name(name).free_names))
+        found = calibrate(board, common, one)
+        if isinstance(found, Rejected):
+            rows.append(dataclasses.replace(row, refused=f"{found.reason}: {found.detail}"))
+            continue
+        held = hold_out(board, found, one, folds=folds, rng=np.random.default_rng(seed))
+        if isinstance(held, Rejected) or not math.isfinite(held.rms_px):
+            reason = f"{held.reason}: {held.detail}" if isinstance(held, Rejected) else "a held-out view is not seen"
+            rows.append(dataclasses.replace(row, refused=reason))
+            continue
+        squares[name] = held
+        rows.append(
+            dataclasses.replace(
+                row,
+                held_out_rms_px=held.rms_px,
+                rms_px=found.rms_px,
+                converged=found.converged,
+                calibration=found,
+            )
+        )
+    if not squares:
+        return Rejected("no_lens", rows[0].refused if rows else "no lens models were asked for")
+    return _ranked(rows, squares)
+
+
+def _common_corners(
+    board: Points3D, views: Sequence[BoardView], config: CalibrationConfig, lenses: Sequence[str]
+) -> list[BoardView] | Rejected:
+    """The views and corners that the best fitting model keeps."""
+    best: Calibration | None = None
+    first: Rejected | None = None
+    for name in lenses:
+        found = calibrate(board, views, dataclasses.replace(config, lens=name))
+        if isinstance(found, Rejected):
+            first = found if first is None else first
+        elif best is None or found.sigma_px < best.sigma_px:
+            best = found
+    if best is None:
+        return Rejected(
+            "no_lens", f"{first.reason}: {first.detail}" if first is not None else "no lens models were asked for"
+        )
+    return views_of(best.observations)
+
+
+def _ranked(rows: list[RankedLens], held: dict[str, HeldOut]) -> tuple[RankedLens, ...]:
+    best = min(held, key=lambda name: held[name].rms_px)
+    judged = []
+    for row in rows:
+        if row.lens not in held:
+            judged.append(row)
+            continue
+        excess = held[row.lens].squares - held[best].squares
+        error = float(np.std(excess, ddof=1) / math.sqrt(len(excess))) if len(excess) > 1 else math.inf
+        judged.append(dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error))
+    able = [row for row in judged if row.lens in held]
+    alike = [row for row in able if row.excess <= row.excess_error]
+    alike = [row for row in alike if row.converged] or alike
+    chosen = min(alike, key=lambda row: (row.coefficients, row.held_out_rms_px))
+    rest = sorted(
+        (row for row in judged if row is not chosen), key=lambda row: (bool(row.refused), row.held_out_rms_px)
+    )
+    return tuple(_compared(row, chosen) for row in (chosen, *rest))
+
+
+def _compared(row: RankedLens, chosen: RankedLens) -> RankedLens:
+    if row.calibration is None or chosen.calibration is None:
+        return row
+    pixels, _ = pixel_grid(chosen.calibration.camera, 24)
+    lengths = projection_difference(chosen.calibration.camera, row.calibration.camera, pixels)
+    finite = lengths[np.isfinite(lengths).all(1)]
+    differs = math.sqrt(float(np.mean(np.sum(finite**2, 1)))) if len(finite) else math.nan
+    return dataclasses.replace(row, differs_px=differs)
+
+
+def views_of(observations: Observations) -> list[BoardView]:
+    """The views behind flat columns, with their weights as covariances."""
+    views = []
+    for v, name in enumerate(observations.names):
+        rows = slice(observations.offsets[v], observations.offsets[v + 1])
+        a, b, c = observations.roots[rows].T
+        equal = np.all((a == 1) & (b == 0) & (c == 1))
+        information = np.stack([np.stack([a * a, a * b], -1), np.stack([a * b, b * b + c * c], -1)], -2)
+        views.append(
+            BoardView(
+                name,
+                observations.width,
+                observations.height,
+                observations.rows[rows],
+                observations.points2D[rows],
+                None if equal else np.linalg.inv(information),
+            )
+        )
+    return views

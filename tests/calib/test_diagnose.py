@@ -1,0 +1,105 @@
+"""Causes are told apart: one fault at a time, and none where there is none."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.diagnose import board_tilts, coverage, diagnose, whiteness
+from calib.refine import CalibrationConfig, calibrate
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import Rotation3
+from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen, with_corners
+
+BOARD = flat_board()
+CONFIG = CalibrationConfig(lens="opencv4", reject=False)
+
+
+def calibrated(views, config=CONFIG):
+    found = calibrate(BOARD, views, config)
+    assert not isinstance(found, Rejected), found
+    return found
+
+
+def causes(found) -> list[str]:
+    return [finding.cause for finding in diagnose(found)]
+
+
+def good(rng, count=40, board=BOARD, reach=0.48, **how):
+    return seen(LENS, board, poses_before(LENS, count, rng, reach=reach, **how), rng)
+
+
+def test_nothing_is_wrong_with_good_views(rng):
+    assert diagnose(calibrated(good(rng))) == ()
+
+
+def test_white_residuals_are_within_a_few_deviations_of_chance(rng):
+    white = whiteness(calibrated(good(rng)))
+    for share, sigma in (white.neighbours, white.board, white.image):
+        assert abs(share) < 5 * sigma
+        assert 0 < sigma < 0.05
+
+
+def test_a_bent_board_is_told_and_its_estimated_shape_mends_it(rng):
+    bend = 0.0008 * (1 - (BOARD[:, :1] / 0.12) ** 2) * [0, 0, 1.0]
+    views = good(rng, board=BOARD + bend)
+    assert "bent_board" in causes(calibrated(views))
+    assert "bent_board" not in causes(calibrated(views, dataclasses.replace(CONFIG, shape="paraboloid")))
+
+
+def test_a_lens_model_that_does_not_fit_is_told(rng):
+    found = causes(calibrated(good(rng), dataclasses.replace(CONFIG, lens="simple_radial")))
+    assert "lens_model" in found
+    assert "bent_board" not in found
+
+
+def test_a_view_that_errs_more_is_named(rng):
+    views = good(rng)
+    views[7] = with_corners(views[7], views[7].points2D + 0.4 * rng.normal(size=views[7].points2D.shape))
+    details = [finding.detail for finding in diagnose(calibrated(views)) if finding.cause == "outlier_view"]
+    assert len(details) == 1
+    assert details[0].startswith("view07")
+
+
+def test_corners_of_the_image_that_were_never_covered_are_told(rng):
+    found = calibrated(good(rng, reach=0.1))
+    assert "uncovered_border" in causes(found)
+    assert not coverage(found)[0, 0]
+
+
+def test_boards_that_are_hardly_tilted_are_told(rng):
+    assert "few_tilts" in causes(calibrated(good(rng, tilt=0.2, reach=0.2)))
+
+
+def test_boards_that_lean_one_way_are_told(rng):
+    poses = [
+        Rigid3(Rotation3.exp(np.array([a, 0.0, 0.0])), np.append(rng.uniform(-0.1, 0.1, 2), rng.uniform(0.3, 0.5)))
+        for a in np.linspace(-0.7, 0.7, 20)
+    ]
+    assert "tilts_about_one_axis" in causes(calibrated(seen(LENS, BOARD, poses, rng)))
+
+
+def test_tilts_are_those_of_the_boards(rng):
+    turns = [(0.4, 0.0, 0.0), (0.0, -0.5, 0.3), (0.2, 0.2, 0.0), (-0.3, 0.1, 1.0)]
+    poses = [Rigid3(Rotation3.exp(np.array(turn)), np.array([0, 0, 0.4])) for turn in turns]
+    found = calibrated(seen(LENS, BOARD, poses, rng))
+    expected = [np.arccos(pose.rotation.matrix[2, 2]) for pose in poses]
+    np.testing.assert_allclose(board_tilts(found)[0], expected, atol=0.02)
+
+
+def test_a_solution_that_is_not_one_is_told(rng):
+    found = calibrated(good(rng), dataclasses.replace(CONFIG, max_iterations=1))
+    assert causes(found)[0] == "not_converged"
+
+
+def test_few_views_are_told(rng):
+    assert "few_views" in causes(calibrated(good(rng, count=5)))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_pixels_far_from_any_board_are_uncertain(count, rng):
+    found = calibrated(good(rng, count=6 * count, reach=0.05))
+    assert "uncertain_corners" in causes(found)
