@@ -8,7 +8,7 @@ from xml.sax.saxutils import escape
 
 from sfm.core.optim.levenberg_marquardt import Iteration
 
-_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP = 720, 220, 90, 34, 70
+_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP = 720.0, 220.0, 90.0, 34.0, 70.0
 _LEAST = 1e-12
 _PANELS = ("cost above its end, as a part of it", "largest entry of the gradient", "damping")
 
@@ -52,8 +52,10 @@ def _panel(name: str, values: Sequence[float], accepted: Sequence[bool], top: fl
             f'<line x1="{_LEFT}" x2="{_LEFT + _WIDTH}" y1="{y(power):.1f}" y2="{y(power):.1f}" stroke="#eee"/>'
         )
         parts.append(f'<text x="{_LEFT - 8}" y="{y(power) + 4:.1f}" text-anchor="end">1e{power}</text>')
-    for k in range(0, len(values), max(1, len(values) // 10)):
-        parts.append(f'<text x="{x(k):.1f}" y="{top + _HEIGHT + 16}" text-anchor="middle">{k}</text>')
+    parts += [
+        f'<text x="{x(k):.1f}" y="{top + _HEIGHT + 16}" text-anchor="middle">{k}</text>'
+        for k in range(0, len(values), max(1, len(values) // 10))
+    ]
     line = " ".join(f"{x(k):.1f},{y(log):.1f}" for k, log in enumerate(logs))
     parts.append(f'<polyline points="{line}" fill="none" stroke="#005ac8" stroke-width="1.5"/>')
     for k, log in enumerate(logs):
