@@ -27,6 +27,8 @@ from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
 _OBSERVATIONS_PER_CHUNK = 8192
 _MAX_CHUNKS = 16
+_OWN_WORK, _NARROW_WORK = 4.0, 0.6
+"""What a coupling takes beside its products with others, and what a product of three rows takes instead of six."""
 SENSOR_COLUMN = MAX_PARAMS
 """Where the six columns of a sensor's tangent begin, behind those of the parameters."""
 BIAS_COLUMN = SENSOR_COLUMN + BLOCK
@@ -113,6 +115,11 @@ class Layout:
         """(rows, 6) places that are no unknowns."""
         return np.concatenate([np.zeros((len(self.slot_frame), BLOCK), bool), self.shared.columns < 0])
 
+    @property
+    def is_narrow(self) -> bool:
+        """Whether no shared row has more than three unknowns."""
+        return not np.any(self.shared.columns[:, 3:] >= 0)
+
     def pattern(self, rows: np.ndarray, columns: np.ndarray) -> BlockPattern:
         """The blocks of S that points and images fill, and those in `rows` and `columns`, of the lower triangle."""
         marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)
@@ -125,14 +132,16 @@ class Layout:
         return BlockPattern(*kernels.marked_blocks(marked))
 
     def row_ranges(self, parts: int) -> list[tuple[int, int]]:
-        """Ranges of rows that take about the same work to eliminate."""
+        """Ranges of rows that take about the same work to eliminate, in products of blocks."""
         if parts == 1:
             return [(0, self.rows)] if self.rows else []
         point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.starts))
-        work = np.bincount(self.slot, np.arange(len(self.slot)) - self.starts[point] + 2.0, self.rows)
+        work = np.bincount(self.slot, np.arange(len(self.slot)) - self.starts[point] + _OWN_WORK, self.rows)
         point = np.repeat(np.arange(len(self.starts) - 1), np.diff(self.shared_starts))
         before = np.arange(len(self.shared_slot)) - self.shared_starts[point] + np.diff(self.starts)[point]
-        work = work + np.bincount(self.shared_slot, before + 1.0, self.rows)  # integers where nothing is counted
+        product = _NARROW_WORK if self.is_narrow else 1.0
+        # Integers where nothing is counted.
+        work = work + np.bincount(self.shared_slot, product * before + _OWN_WORK, self.rows)
         running = np.cumsum(work)
         cuts = np.searchsorted(running, np.arange(1, parts) * (running[-1] / parts) if len(running) else [])
         edges = [0, *(int(cut) + 1 for cut in cuts), self.rows]

@@ -122,7 +122,7 @@ class ReducedSystem:
         self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
-        self._narrow = not np.any(layout.shared.columns[:, 3:] >= 0)
+        self._narrow = layout.is_narrow
         parts = (len(couplings.slot) + len(couplings.shared_slot)) // _COUPLINGS_PER_THREAD
         self._ranges = layout.row_ranges(min(max(parts, 1), workers.threads))
         self.gradient = self.scaling = self._own_gradient = np.zeros((layout.rows, BLOCK))

@@ -11,7 +11,8 @@ import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from functools import partial
+from typing import TypeVar, cast
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -62,13 +63,30 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = max(threads, 1)
-        self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
+        self._pool = ThreadPoolExecutor(self.threads - 1) if self.threads > 1 else None
 
     def map(self, function: Callable[[Item], Result], jobs: Sequence[Item]) -> list[Result]:
-        """`[function(job) for job in jobs]`."""
+        """`[function(job) for job in jobs]`; the calling thread takes jobs like the others."""
         if self._pool is None or len(jobs) < 2:
             return [function(job) for job in jobs]
-        return list(self._pool.map(function, jobs))
+        results: list[Result | None] = [None] * len(jobs)
+        take_turns = partial(_take_jobs, function, jobs, itertools.count(), results)
+        others = [self._pool.submit(take_turns) for _ in range(min(self.threads, len(jobs)) - 1)]
+        try:
+            take_turns()
+        finally:
+            for other in others:
+                if not other.cancel():  # one that has not begun has nothing left to do
+                    other.result()
+        return cast("list[Result]", results)
+
+
+def _take_jobs(
+    function: Callable[[Item], Result], jobs: Sequence[Item], turn: Iterator[int], results: list[Result | None]
+) -> None:
+    """Does the job whose turn it is until none is left; `turn` is shared by threads."""
+    while (k := next(turn)) < len(jobs):
+        results[k] = function(jobs[k])
 
 
 def chunk_bounds(count: int, chunks: int) -> list[tuple[int, int]]:

@@ -107,26 +107,27 @@ def ranges(count: int) -> list[tuple[int, int]]:
     return [(0, count // 3), (count // 3, count)]
 
 
-def linearized(slow: Slow) -> dict[str, np.ndarray]:
-    """What `linearize_images` fills, and the cost."""
+def evaluated(slow: Slow, derive: bool, lost_cost: float = LOST_COST) -> dict[str, np.ndarray]:
+    """What `evaluate_images` fills where it derives, and the cost."""
     lay, problem = slow.layout, slow.problem
     images, widest = len(problem.image_cameras), lay.columns.shape[1]
     out = {
         "rows": np.zeros((len(lay.image), 9 + 3 * widest)), "h": np.zeros((images, 6)),
         "F": np.zeros((images, 6, widest)), "G": np.zeros((images, widest, widest)), "f": np.zeros((images, widest)),
     }  # fmt: skip
-    ids = problem.model_ids.astype(np.int64)
+    ids, costs = problem.model_ids.astype(np.int64), np.full(len(lay.image), -1.0)
     poses, centers = problem.cams_from_world, slow.frame_centers()[lay.slot_frame]
     cost = sum(
-        kernels.linearize_images(
+        kernels.evaluate_images(
             first, last, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision, lay.image_slot,
             problem.image_cameras.copy(), ids, kernels.squared_limits(ids, problem.camera_params.copy()),
             lay.column_count, lay.columns, poses.rotation.matrix, poses.translation.copy(), centers,
-            problem.camera_params.copy(), problem.points3D.copy(), loss_id(slow.loss), SCALE, LOST_COST, *out.values(),
+            problem.camera_params.copy(), problem.points3D.copy(), loss_id(slow.loss), SCALE, lost_cost,
+            derive, costs, *out.values(),
         )
         for first, last in ranges(images)
     )  # fmt: skip
-    return {**out, "cost": np.array(cost)}
+    return {**out, "cost": np.array(cost), "costs": costs}
 
 
 def close(found: np.ndarray, expected: np.ndarray) -> None:
@@ -135,7 +136,8 @@ def close(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_images_put_into_rows_and_sums_what_their_observations_do_one_by_one(slow):
-    found, lay = linearized(slow), slow.layout
+    found, lay = evaluated(slow, derive=True), slow.layout
+    assert np.all(found.pop("costs") == -1)
     expected = {name: np.zeros_like(value) for name, value in found.items()}
     lost = 0
     for o in range(len(lay.image)):
@@ -161,18 +163,11 @@ def test_images_put_into_rows_and_sums_what_their_observations_do_one_by_one(slo
 
 
 def test_costs_of_images_are_those_of_their_observations(slow):
-    lay, problem = slow.layout, slow.problem
-    ids, costs = problem.model_ids.astype(np.int64), np.zeros(len(lay.image))
-    for first, last in ranges(len(problem.image_cameras)):
-        kernels.costs_of_images(
-            first, last, lay.image_offsets, lay.image_point, lay.place, lay.observed, lay.precision,
-            problem.image_cameras.copy(), ids, kernels.squared_limits(ids, problem.camera_params.copy()),
-            problem.cams_from_world.rotation.matrix, problem.cams_from_world.translation.copy(),
-            problem.camera_params.copy(), problem.points3D.copy(), loss_id(slow.loss), SCALE, costs,
-        )  # fmt: skip
-    expected = np.array([slow.observation(o)[0] for o in range(len(costs))])
-    assert 0 < np.isnan(expected).sum() < len(costs) / 2
-    np.testing.assert_allclose(costs, expected, rtol=1e-10)
+    found = evaluated(slow, derive=False, lost_cost=np.nan)
+    expected = np.array([slow.observation(o)[0] for o in range(len(found["costs"]))])
+    assert 0 < np.isnan(expected).sum() < len(expected) / 2
+    np.testing.assert_allclose(found["costs"], expected, rtol=1e-10)
+    assert not any(found[name].any() for name in ("rows", "h", "F", "G", "f"))
 
 
 def couplings_of(lay: Layout, p: int) -> tuple[range, range]:
@@ -252,15 +247,13 @@ def test_points_settle_where_they_keep_the_most_projections(slow, rng):
     trial = X + 0.3 * rng.normal(size=X.shape)
     trial[7] = X[7] - 20 * problem.cams_from_world[0].rotation.matrix[2]  # behind its cameras
     costs = np.array([slow.observation(o, trial)[0] for o in range(len(lay.image))])
+    costs_here = np.array([slow.observation(o)[0] for o in range(len(lay.image))])
     V, g = np.abs(rng.normal(size=(count, 6))), rng.normal(size=(count, 3))
     V[9, [0, 3]] = 1e-20, 1e10  # at least a part of the trace counts, 100 here
     moved, totals = trial.copy(), np.full((2, 5), np.nan)
     for (first, last), total in zip(ranges(count), totals, strict=True):
         kernels.settle_points(
-            first, last, lay.offsets, lay.source, lay.image, lay.observed, lay.precision, problem.image_cameras.copy(),
-            problem.model_ids.astype(np.int64), problem.cams_from_world.rotation.matrix,
-            problem.cams_from_world.translation.copy(), problem.camera_params.copy(), X, loss_id(slow.loss), SCALE,
-            LOST_COST, DAMPING, V, g, costs, moved, total,
+            first, last, lay.offsets, X, LOST_COST, DAMPING, V, g, costs, costs_here, moved, total
         )  # fmt: skip
     expected, stayed = np.zeros(5), []
     for p in range(count):

@@ -83,21 +83,14 @@ def test_lanes_are_fetched_up_to_the_end_of_the_image_and_then_repeat_the_last(r
     observed, precision = rng.normal(size=(100, 2)), rng.uniform(0.5, 2, 100)
     for first, last in ((0, 100), (70, 100), (99, 100)):
         w = np.full(lanes.ROWS * LANES, np.nan)
-        lanes.fetch(first, last, point, observed, precision, points3D, w)
+        lanes.fetch(first, last, point, observed, precision, points3D, R, T, w)
         rows = w.reshape(-1, LANES)
         for n in range(LANES):
             o = min(first + n, last - 1)
             np.testing.assert_array_equal(rows[lanes._WORLD : lanes._WORLD + 3, n], points3D[point[o]])
             np.testing.assert_array_equal(rows[lanes._OBSERVED : lanes._OBSERVED + 2, n], observed[o])
             assert rows[lanes._PRECISION, n] == (precision[o] if first + n < last else 0)
-
-
-def test_points_are_brought_into_the_camera(rng):
-    space = workspace(rng)
-    space.world[UNSEEN[1]] = 0
-    space.w.reshape(-1, LANES)[lanes._WORLD : lanes._WORLD + 3] = space.world.T
-    lanes.transform(R, T, space.w)
-    close(space.rows(camera_lanes.X, 3), np.array([R @ x + T for x in space.world]))
+            close(rows[camera_lanes.X : camera_lanes.X + 3, n], R @ points3D[point[o]] + T)
 
 
 @pytest.mark.parametrize("lost_cost", [LOST_COST, np.nan])
