@@ -122,7 +122,7 @@ def move_points(
     """The points `first:last` after the step that back-substitution gives them."""
     for p in range(first, last):
         y0, y1, y2 = X[p, 0], X[p, 1], X[p, 2]
-        if not M[p, 0] > 0.0:
+        if not M[p, 0] + M[p, 3] + M[p, 5] > 0.0:
             moved[p, 0], moved[p, 1], moved[p, 2] = y0, y1, y2
             continue
         q0, q1, q2 = g[p, 0], g[p, 1], g[p, 2]

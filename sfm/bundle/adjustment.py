@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from sfm.bundle.gauge import held_by_two_cameras, put_back
+from sfm.bundle.gauge import held_by_three_points, held_by_two_cameras, put_back, put_back_by_points
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
 from sfm.bundle.reduced import SolverPlan
@@ -35,7 +35,7 @@ def adjust(
     moved, is charged like the worst at the start (at least 100 px, or 100 standard deviations).
 
     The scene is free to turn, move and grow on the way, which takes fewer steps than to hold some of its poses; with
-    the gauge `two_cameras` it is put back in the end, see `gauge`.
+    another gauge than `free` it is put back in the end, see `gauge`.
 
     If `config.graduated`, the costs and the table are those of the last scale.
 
@@ -51,8 +51,9 @@ def adjust(
         problem = _moved(problem, system)
     system, active = system_of(problem, free, threads, announce=partial(_tell, observer, scope, problem))
     result = _result(problem, system, _minimize(system, free), active)
-    if config.gauge == "two_cameras" and any(row.accepted for row in result.table[1:]):
-        result = dataclasses.replace(result, problem=put_back(start, result.problem, system.layout))
+    if config.gauge != "free" and any(row.accepted for row in result.table[1:]):
+        back = put_back if config.gauge == "two_cameras" else put_back_by_points
+        result = dataclasses.replace(result, problem=back(start, result.problem, system.layout))
     observer(
         BundleAdjusted(
             scope=scope,
@@ -114,7 +115,8 @@ def _laid_out(
 ) -> BundleSystem:  # fmt: skip
     layout = lay_out(problem, active)
     held = np.zeros((len(layout.slot_frame), 6), bool)
-    if config.gauge == "two_cameras":
+    by_points = config.gauge == "three_points" and held_by_three_points(problem, layout) is not None
+    if config.gauge != "free" and not by_points:
         held = held_by_two_cameras(problem, layout)
     return BundleSystem(problem, layout, held, config, threads, announce)
 

@@ -7,9 +7,9 @@ reduced matrix S is the covariance Σ of poses and shared parameters, and that o
     Σ = S⁻¹        Σ_p = M_p + M_p E_pᵀ Σ E_p M_p
 
 so the whole inverse, points against points, is never formed. What the scene as a whole may do (turn, move, grow) is
-not determined by images. `two_cameras` measures everything relative to two images, whose own uncertainty is then
-zero where they are held. `free` spreads it: with Q an orthonormal basis of these motions, as they move poses and
-parameters, and S⁻ any inverse on what is left,
+not determined by images. `two_cameras` measures everything relative to two images, `three_points` to three points,
+whose own uncertainty is then zero where they are held. `free` spreads it: with Q an orthonormal basis of these motions,
+as they move poses and parameters, and S⁻ any inverse on what is left,
 
     Σ = (1 − Q Qᵀ) S⁻ (1 − Q Qᵀ)
 
@@ -31,7 +31,7 @@ from scipy.linalg import get_lapack_funcs
 
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.bundle.adjustment import system_of
-from sfm.bundle.gauge import frame_centers
+from sfm.bundle.gauge import frame_centers, held_by_three_points
 from sfm.bundle.knowledge import motions_seen
 from sfm.bundle.layout import Layout
 from sfm.bundle.problem import BundleConfig, BundleProblem
@@ -91,9 +91,10 @@ def covariance(
     """
     system, _ = system_of(problem, dataclasses.replace(config, solver="dense"), threads)
     layout, (cost, _) = system.layout, system.linearize()
-    known = system.information()
+    held = held_by_three_points(problem, layout) if config.gauge == "three_points" else None
+    known = system.information(held)
     motions = _motions(problem, layout)
-    if config.gauge == "two_cameras":
+    if config.gauge != "free":
         motions = motions[:, :0]
     sigma = _inverse(known.reduced, ~system.held.ravel(), motions)
     if isinstance(sigma, int):
@@ -104,6 +105,7 @@ def covariance(
         _POINT_CONDITION, points,
     )  # fmt: skip
     freedom = 2 * len(layout.image) + system.prior_count - system.free_count + motions.shape[1]
+    freedom += sum(3 - basis.shape[1] for basis in held.bases) if held is not None else 0
     poses, centers = _pose_blocks(problem, layout, sigma)
     return BundleCovariance(
         poses=poses,

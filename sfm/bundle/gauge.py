@@ -6,13 +6,19 @@ free, and a similarity puts the scene back in the end (`put_back`).
 Rotating, moving and scaling the world together with all cameras changes no residual. Holding the pose of one frame
 takes six of the seven freedoms. Scaling about that frame's centre then moves a second one along their baseline:
 holding the coordinate of its centre in which this baseline is longest takes the last. Where a sensor sits on its rig at
-a known distance, the scale is seen and nothing of a second frame is held. Priors see some of the motions, and then
+a known distance, the scale is seen and nothing of a second frame is held.
+
+Three points do as well: one stays where it is, a second, too (on its ray from the first, where the scale is seen),
+and a third in the plane of the three.
+
+Priors see some of the motions, and then
 less is held: see `prior_gauge`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,6 +29,61 @@ from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.geometry.similarity import Sim3
+
+
+class HeldPoints(NamedTuple):
+    """Three points, and orthonormal bases (3, k) of the directions that are left to each."""
+
+    points: tuple[int, int, int]
+    bases: tuple[FloatArray, FloatArray, FloatArray]
+
+
+def held_by_three_points(problem: BundleProblem, layout: Layout) -> HeldPoints | None:
+    """Three points far apart and seen often; None where anything is constant or known, or all are on a line."""
+    chosen, seen = _anchor_and_second(problem, layout), np.diff(layout.offsets)
+    if chosen is None or layout.frame_slot[chosen[0]] < 0 or problem.priors:
+        return None
+    if not problem.free_points[seen > 0].all():
+        return None
+    often = np.flatnonzero(2 * seen >= seen.max(initial=0))
+    places = problem.points3D[often]
+    first = int(np.argmax(seen[often]))
+    arms = places - places[first]
+    second = int(np.argmax(np.linalg.norm(arms, axis=1)))
+    along = arms[second] / max(float(np.linalg.norm(arms[second])), 1e-300)
+    across = arms - np.outer(arms @ along, along)
+    third = int(np.argmax(np.linalg.norm(across, axis=1)))
+    distance = float(np.linalg.norm(across[third]))
+    if not distance > 1e-6 * np.linalg.norm(arms[second]):
+        return None
+    none, ray = np.zeros((3, 0)), along[:, None] if _scale_is_seen(problem, layout) else np.zeros((3, 0))
+    plane = np.stack([along, across[third] / distance], axis=1)
+    return HeldPoints((int(often[first]), int(often[second]), int(often[third])), (none, ray, plane))
+
+
+def put_back_by_points(before: BundleProblem, after: BundleProblem, layout: Layout) -> BundleProblem:
+    """`after`, moved as a whole so that it agrees with `before` in what `held_by_three_points` holds."""
+    held = held_by_three_points(before, layout)
+    if held is None:
+        return put_back(before, after, layout)
+    old, new = before.points3D[list(held.points)], after.points3D[list(held.points)]
+    axes = _axes(old) @ _axes(new).T
+    scale = 1.0
+    if not held.bases[1].shape[1]:
+        scale = float(np.linalg.norm(old[1] - old[0]) / np.linalg.norm(new[1] - new[0]))
+    if not np.isfinite(axes).all() or not 0 < scale < np.inf:
+        return after
+    turn = Rotation3.from_matrix(axes)
+    return _transformed(after, layout, Sim3(np.array(scale), turn, old[0] - scale * (turn @ new[0])))
+
+
+def _axes(corners: FloatArray) -> FloatArray:
+    """(3, 3) columns: along the first side of a triangle, in its plane, and normal to it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (corners[1] - corners[0]) / np.linalg.norm(corners[1] - corners[0])
+        normal = np.cross(along, corners[2] - corners[0])
+        normal = normal / np.linalg.norm(normal)
+    return np.stack([along, np.cross(normal, along), normal], axis=1)
 
 
 def held_by_two_cameras(problem: BundleProblem, layout: Layout) -> BoolArray:
@@ -88,17 +149,20 @@ def put_back(before: BundleProblem, after: BundleProblem, layout: Layout) -> Bun
     if not 0 < scale < np.inf:
         return after
     shift = were[anchor] - scale * (turn @ are[anchor])
-    return _transformed(after, layout, old, anchor, Sim3(np.array(scale), turn, shift))
+    return _transformed(after, layout, Sim3(np.array(scale), turn, shift), (anchor, old[anchor]))
 
 
-def _transformed(problem: BundleProblem, layout: Layout, old: Rigid3, anchor: int, motion: Sim3) -> BundleProblem:
-    """The observed parts of the problem, moved; the anchor as it was, to the last bit."""
+def _transformed(
+    problem: BundleProblem, layout: Layout, motion: Sim3, exact: tuple[int, Rigid3] | None = None
+) -> BundleProblem:
+    """The observed parts of the problem, moved; one frame gets a pose to the last bit."""
     frames, moving = _frames(problem), layout.slot_frame
     turns, translations = frames.rotation.wxyz.copy(), frames.translation.copy()
     turned = frames.rotation[moving] @ motion.rotation.inverse()
     turns[moving] = turned.wxyz
     translations[moving] = -(turned @ (motion @ frames.center[moving]))
-    turns[anchor], translations[anchor] = old.rotation.wxyz[anchor], old.translation[anchor]
+    if exact is not None:
+        turns[exact[0]], translations[exact[0]] = exact[1].rotation.wxyz, exact[1].translation
     frames, points3D = Rigid3(Rotation3(turns), translations), problem.points3D.copy()
     seen = _seen(layout)
     points3D[seen] = motion @ points3D[seen]

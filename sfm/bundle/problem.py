@@ -201,9 +201,10 @@ class BundleConfig:
     """Stop where a full step lowers the cost by less than this part."""
     gradient_tolerance: float = 1e-10
     """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
-    gauge: Literal["two_cameras", "free"] = "two_cameras"
+    gauge: Literal["two_cameras", "three_points", "free"] = "two_cameras"
     """Where the data leave the frame of the scene open: keep one pose and one coordinate of a second centre as they
-    were, or leave the scene wherever the steps took it. Covariances are relative to these two, or spread over all."""
+    were, or two points and the plane through them and a third, or leave the scene wherever the steps took it.
+    Covariances are relative to these, or spread over all."""
     solver: SolverChoice = "auto"
     """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
 
@@ -214,8 +215,8 @@ class BundleConfig:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
         if self.solver not in get_args(SolverChoice):
             raise ValueError(f"solver must be one of {', '.join(get_args(SolverChoice))}, got {self.solver!r}")
-        if self.gauge not in ("two_cameras", "free"):
-            raise ValueError(f"gauge must be two_cameras or free, got {self.gauge!r}")
+        if self.gauge not in ("two_cameras", "three_points", "free"):
+            raise ValueError(f"gauge must be two_cameras, three_points or free, got {self.gauge!r}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

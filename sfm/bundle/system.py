@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.bundle import _kernels as kernels
+from sfm.bundle.gauge import HeldPoints
 from sfm.bundle.knowledge import Knowledge
 from sfm.bundle.layout import Layout
 from sfm.bundle.prior_terms import bias_count
@@ -159,9 +160,13 @@ class BundleSystem:
         self._over_images(self._state, self._state.points3D, loss_id(loss), np.nan, self.costs)
         return self.costs
 
-    def information(self) -> Information:
-        """What the problem says about its parameters, as last linearised."""
-        self._eliminate(0.0)
+    def information(self, held: HeldPoints | None = None) -> Information:
+        """What the problem says about its parameters, as last linearised; points may be held in some directions."""
+        self._run(lambda job: invert_blocks(*job, self._V, 0.0, self._M), self.layout.point_chunks)
+        if held is not None:
+            for point, basis in zip(held.points, held.bases, strict=True):
+                self._M[point] = _within(self._V[point], basis)
+        self._reduced.eliminate(self._row_centers(), self._state.points3D, self._M, self._g)
         return Information(self._reduced.matrix(), self._couplings, self._row_centers(), self._V, self._M)
 
     def try_step(self, damping: float) -> Trial | None:
@@ -229,6 +234,13 @@ def _forecast_bytes(layout: Layout, plan: SolverPlan, images: int, points: int) 
     couplings = 52 * len(layout.slot) + 148 * len(layout.shared_slot)
     image = 8 * (6 + 6 * columns + columns**2 + columns) + 8 * 32
     return plan.bytes + observation * len(layout.image) + couplings + image * images + 8 * 29 * points
+
+
+def _within(information: FloatArray, basis: FloatArray) -> FloatArray:
+    """(6,) the inverse of a point's information within the directions (3, k) of a basis."""
+    V = information[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3)
+    inverse = basis @ np.linalg.inv(basis.T @ V @ basis) @ basis.T
+    return inverse[np.triu_indices(3)]
 
 
 class Information(NamedTuple):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.bundle import BundleConfig, adjust, squared_errors
-from sfm.core.events import BundleAdjusted
+from sfm.core.events import BundleAdjusted, BundlePlanned
 from sfm.core.geometry.rigid import Rigid3
 
 TIGHT = BundleConfig(relative_cost_tolerance=1e-12, max_iterations=200)
@@ -230,7 +230,10 @@ def test_the_inputs_are_not_modified_and_the_event_tells_the_outcome(make_proble
     assert np.array_equal(start.points3D, copies[0])
     assert np.array_equal(start.camera_params, copies[1])
     assert np.array_equal(start.cams_from_world.translation, copies[2])
-    (event,) = events
+    plan, event = events
+    assert isinstance(plan, BundlePlanned)
+    assert (plan.scope, plan.solver, plan.observations) == ("local", "dense", len(start.obs_images))
+    assert 0 < plan.memory_bytes < 1 << 20
     assert isinstance(event, BundleAdjusted)
     assert (event.scope, event.reason) == ("local", result.reason)
     assert (event.initial_cost, event.final_cost) == (result.initial_cost, result.final_cost)

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, adjust, covariance, squared_errors
-from sfm.bundle.gauge import held_by_two_cameras
+from sfm.bundle.gauge import held_by_three_points, held_by_two_cameras
 from sfm.bundle.layout import lay_out
 from sfm.core.cameras import MODELS, Camera
 from sfm.core.errors import Rejected
@@ -220,3 +220,44 @@ def test_a_point_on_one_ray_has_no_covariance_and_others_keep_theirs(make_proble
     assert np.isnan(found.points3D[7]).all()
     assert np.isfinite(np.delete(found.points3D, 7, axis=0)).all()
     assert np.isfinite(found.poses).all()
+
+
+def test_three_points_hold_the_scene_as_well_as_two_cameras(make_problem, perturbed, rng):
+    truth = make_problem(rng, images=5, points=50, model="SIMPLE_RADIAL", free_params=(0,), seen=0.95)
+    layout = lay_out(truth, np.ones(len(truth.obs_images), bool))
+    held = held_by_three_points(truth, layout)
+    assert held is not None
+    points, noise = list(held.points), 0.3
+    config = BundleConfig(gauge="three_points", relative_cost_tolerance=1e-12)
+    predicted = covariance(dataclasses.replace(truth, obs_sigmas=np.full(len(truth.obs_images), noise)), config)
+    assert isinstance(predicted, BundleCovariance)
+    assert not predicted.points3D[points[:2]].any()
+    plane = held.bases[2]
+    normal = np.cross(plane[:, 0], plane[:, 1])
+    np.testing.assert_allclose(normal @ predicted.points3D[points[2]], 0, atol=1e-15)
+    centers, others = [], []
+    for _ in range(300):
+        measured = truth.obs_points2D + noise * rng.normal(size=truth.obs_points2D.shape)
+        found = adjust(dataclasses.replace(truth, obs_points2D=measured), config).problem
+        centers.append(found.cams_from_world.center - truth.cams_from_world.center)
+        others.append(found.points3D - truth.points3D)
+    np.testing.assert_allclose(np.array(others)[:, points[:2]], 0, atol=1e-9)
+    ratio = np.sqrt(np.mean(np.square(centers), axis=0) / np.einsum("iaa->ia", predicted.centers))
+    assert 0.93 < np.median(ratio) < 1.07
+    rest = np.delete(np.arange(50), points)
+    ratio = np.sqrt(np.mean(np.square(others), axis=0)[rest] / np.einsum("iaa->ia", predicted.points3D)[rest])
+    assert 0.95 < np.median(ratio) < 1.05
+    free, two = covariance(truth, FREE), covariance(truth)
+    assert isinstance(free, BundleCovariance)
+    assert isinstance(two, BundleCovariance)
+    assert predicted.variance_factor * noise**2 == pytest.approx(two.variance_factor, rel=1e-6)
+    np.testing.assert_allclose(predicted.params / noise**2, two.params, rtol=1e-5)
+
+
+def test_three_points_leave_a_scene_alone_that_something_else_holds(make_problem, rng):
+    problem = make_problem(rng, images=5, points=30)
+    fixed = dataclasses.replace(problem, free_poses=np.array([False, True, True, True, True]))
+    by_points, by_cameras = covariance(fixed, BundleConfig(gauge="three_points")), covariance(fixed)
+    assert isinstance(by_points, BundleCovariance)
+    assert isinstance(by_cameras, BundleCovariance)
+    np.testing.assert_allclose(by_points.centers, by_cameras.centers, rtol=1e-9)

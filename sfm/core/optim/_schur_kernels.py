@@ -92,7 +92,7 @@ def eliminate(
     for p in range(len(X)):
         poses, shared = starts[p + 1] - starts[p], shared_starts[p + 1] - shared_starts[p]
         first, last = starts[p], shared_starts[p]
-        moves = M[p, 0] > 0.0
+        moves = M[p, 0] + M[p, 3] + M[p, 5] > 0.0
         count = poses + shared
         if (
             count == 0
