@@ -35,7 +35,8 @@ def convergence_svg(table: Sequence[Iteration], title: str) -> str:
 
 def _panel(name: str, values: Sequence[float], accepted: Sequence[bool], top: float) -> list[str]:
     logs = [math.log10(value) for value in values]
-    low, high = math.floor(min(logs)), max(math.ceil(max(logs)), math.floor(min(logs)) + 1)
+    low = math.floor(min(logs))
+    high = max(math.ceil(max(logs)), low + 1)
 
     def x(k: int) -> float:
         return _LEFT + _WIDTH * k / max(len(values) - 1, 1)
@@ -48,10 +49,9 @@ def _panel(name: str, values: Sequence[float], accepted: Sequence[bool], top: fl
         f'<rect x="{_LEFT}" y="{top}" width="{_WIDTH}" height="{_HEIGHT}" fill="none" stroke="#999"/>',
     ]
     for power in range(low, high + 1, max(1, (high - low) // 6)):
-        parts.append(
-            f'<line x1="{_LEFT}" x2="{_LEFT + _WIDTH}" y1="{y(power):.1f}" y2="{y(power):.1f}" stroke="#eee"/>'
-        )
-        parts.append(f'<text x="{_LEFT - 8}" y="{y(power) + 4:.1f}" text-anchor="end">1e{power}</text>')
+        at = y(float(power))
+        parts.append(f'<line x1="{_LEFT}" x2="{_LEFT + _WIDTH}" y1="{at:.1f}" y2="{at:.1f}" stroke="#eee"/>')
+        parts.append(f'<text x="{_LEFT - 8}" y="{at + 4:.1f}" text-anchor="end">1e{power}</text>')
     parts += [
         f'<text x="{x(k):.1f}" y="{top + _HEIGHT + 16}" text-anchor="middle">{k}</text>'
         for k in range(0, len(values), max(1, len(values) // 10))
