@@ -11,10 +11,12 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from calib.boards import Board
+from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
@@ -23,12 +25,16 @@ from calib.refine_board import ShapeKind
 from calib.refine_views import BoardView
 from calib.uncertainty import CalibrationCovariance, covariance
 from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, hold_out, split_half
+from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
-from sfm.core.errors import Rejected
+from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, Observer, StageFinished, StageStarted
 
 STAGE = "calibration"
 AUTO = "auto"
+Auto: TypeAlias = Literal["auto"]
+_WHILE_LENS_IS_CHOSEN: ShapeKind = "paraboloid"
+"""Of all shapes it costs least where it is not needed, and takes most of a bend."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -63,8 +69,8 @@ class CameraPlan:
 
     lens: str = AUTO
     """Row of `refine_lenses.LENSES`, or auto: the one that predicts held-out views best."""
-    shape: ShapeKind = "flat"
-    """What the board may be; see `refine_board`."""
+    shape: ShapeKind | Auto = "auto"
+    """What the board may be (see `refine_board`), or auto: what predicts held-out views best."""
     focal_px: float | None = None
     """First guess where it is known."""
     folds: int = 5
@@ -74,9 +80,11 @@ class CameraPlan:
 
     @property
     def config(self) -> CalibrationConfig:
-        """For the solver; the lens is its default where it is still to be chosen."""
-        config = CalibrationConfig(shape=self.shape, focal_px=self.focal_px)
-        return config if self.lens == AUTO else dataclasses.replace(config, lens=self.lens)
+        """For the solver; lens and shape are defaults where they are still to be chosen."""
+        config = CalibrationConfig(focal_px=self.focal_px)
+        if self.lens != AUTO:
+            config = dataclasses.replace(config, lens=self.lens)
+        return config if self.shape == "auto" else dataclasses.replace(config, shape=self.shape)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +92,7 @@ class CalibratedCamera(Value):
     """A calibration, and what is to be thought of it.
 
     Attributes:
-        ranking: of lens models, the chosen one first; empty where it was given.
+        lenses, shapes: ranked, the chosen one first; empty where it was given.
         covariances, by_view: residuals taken for independent, and only views; see `uncertainty`.
         held_out, halves: errors on views that were held out, and the difference between the cameras of two halves.
         left_out: photos and views without a part in it, from detection on.
@@ -92,7 +100,9 @@ class CalibratedCamera(Value):
     """
 
     found: Calibration
-    ranking: tuple[RankedLens, ...]
+    config: CalibrationConfig
+    lenses: tuple[RankedLens, ...]
+    shapes: tuple[RankedShape, ...]
     covariances: CalibrationCovariance | Rejected
     by_view: CalibrationCovariance | Rejected
     held_out: HeldOut | Rejected
@@ -102,19 +112,30 @@ class CalibratedCamera(Value):
 
 
 def see_board(
-    sources: Sequence[Path], board: Board, *, threads: int = 0, use_cache: bool = True, weighted: bool = True,
-    observer: Observer = SILENT,
+    sources: Sequence[Path], board: Board | None, *, size: tuple[int, int] | None = None, threads: int = 0,
+    use_cache: bool = True, weighted: bool = False, observer: Observer = SILENT,
 ) -> Sightings:  # fmt: skip
-    """Looks for a board in photos.
+    """Looks for a board in photos, or reads corners that were found before.
 
     Args:
-        sources: folders of photos, or photos.
+        sources: folders of photos, photos, or files of corners; see `corner_files`.
+        board: may be None for files that name it.
+        size: width and height in px, for files of corners that do not tell it.
         threads: 0 for all cores.
         use_cache: takes what was found before, and keeps what is found.
-        weighted: views carry the covariances of their corners.
+        weighted: views carry the covariances of their corners. They tell how well a corner's pixels fix it, but not
+            what its surroundings shift it by, which is most: with them, held-out views of nine sets of photos come out
+            0 to 6 % worse, and never better.
     Raises:
-        InputError: there are no photos.
+        InputError: there are no photos, or a file of corners does not do.
+        ConfigError: there is no board, or no size where it is needed.
     """
+    files = corner_files(sources)
+    if files:
+        found, points3D, views, left_out = read_corners(files, board, size)
+        return Sightings(found, points3D, views, left_out, digest_of(files), "corners")
+    if board is None:
+        raise ConfigError("no board is named", remedy="for example --board chessboard:9x6:25mm (inner corners)")
     photos = find_photos(sources)
     cache = detection_cache() if use_cache else None
     seen = detect_photos(photos, board, threads=threads, cache=cache, observer=observer)
@@ -166,25 +187,39 @@ def calibrate_camera(
         why there is none; see `calibrate` and `choose_lens`.
     """
     observer(StageStarted(stage=STAGE))
-    config, ranking = plan.config, ()
+    config = plan.config
+    lenses: tuple[RankedLens, ...] = ()
+    shapes: tuple[RankedShape, ...] = ()
     if plan.lens == AUTO:
-        ranking = choose_lens(seen.points3D, seen.views, config, folds=plan.folds, seed=plan.seed)
-        if isinstance(ranking, Rejected):
-            return ranking
-        config = dataclasses.replace(config, lens=ranking[0].lens)
-    found = calibrate(seen.points3D, seen.views, config)
+        trial = dataclasses.replace(config, shape=_WHILE_LENS_IS_CHOSEN) if plan.shape == "auto" else config
+        ranked = choose_lens(seen.points3D, seen.views, trial, folds=plan.folds, seed=plan.seed)
+        if isinstance(ranked, Rejected):
+            return ranked
+        lenses, config = ranked, dataclasses.replace(config, lens=ranked[0].lens)
+    found = held_out = None
+    if plan.shape == "auto":
+        judged = choose_shape(seen.points3D, seen.views, config, folds=plan.folds, seed=plan.seed)
+        if isinstance(judged, Rejected):
+            return judged
+        shapes, config = judged, dataclasses.replace(config, shape=judged[0].kind)
+        found, held_out = judged[0].calibration, judged[0].held
+    if found is None:
+        found = calibrate(seen.points3D, seen.views, config)
     if isinstance(found, Rejected):
         return found
-    held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
+    if held_out is None or held_out.counts.sum() != len(found.residuals):
+        held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     halves = split_half(seen.points3D, found, config, rng=np.random.default_rng(plan.seed))
     observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
     return CalibratedCamera(
-        found,
-        ranking,
-        covariance(found),
-        covariance(found, by_view=True),
-        held_out,
-        halves,
-        (*seen.left_out, *found.rejected_views),
-        diagnose(found),
+        found=found,
+        config=config,
+        lenses=lenses,
+        shapes=shapes,
+        covariances=covariance(found),
+        by_view=covariance(found, by_view=True),
+        held_out=held_out,
+        halves=halves,
+        left_out=(*seen.left_out, *found.rejected_views),
+        findings=diagnose(found),
     )
