@@ -14,6 +14,8 @@ from sfm.core.errors import ExitCode, SfmError
 COMMANDS = {
     "board": "a board to print: PDF or SVG at true scale",
     "detect": "the corners of a board in photos, and what they look like",
+    "stereo": "two cameras that are mounted together, and how they stand",
+    "rig": "several such cameras, of any models",
 }
 """In the order in which they are used; `calib.cli.<name>` holds each."""
 
