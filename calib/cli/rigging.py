@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 AUTO = "auto"
 _REMEDIES = {
-    "camera_without_board": "look at `calib detect` for this camera",
     "cameras_not_connected": "take frames that show the board to cameras of both groups",
     "cameras_disagree": "see docs/calibrate_rigs.md; --pair says how photos are paired",
     "no_common_frame": "name photos alike (left/07.png, right/07.png), or pair them by --pair order",
@@ -167,16 +166,17 @@ def lenses_of(options: CommonOptions, names: tuple[str, ...]) -> dict[str, str]:
     Raises:
         ConfigError: a camera or a model is unknown.
     """
-    from calib.refine_lenses import LENSES
+    from calib.refine_lenses import lens_called
 
     chosen = dict.fromkeys(names, AUTO)
     for word in options.model.split(","):
-        name, equals, lens = word.rpartition("=")
+        name, equals, called = word.rpartition("=")
         if equals and name not in names:
             raise ConfigError(f"--model: there is no camera {name!r}", remedy=f"cameras are {', '.join(names)}")
-        if lens != AUTO and lens not in (one.name for one in LENSES):
-            known = ", ".join([AUTO, *(one.name for one in LENSES)])
-            raise ConfigError(f"unknown lens model {lens!r}", remedy=f"known are {known}")
+        try:
+            lens = AUTO if called.lower() == AUTO else lens_called(called).name
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
         chosen |= {name: lens} if equals else dict.fromkeys(names, lens)
     return chosen
 

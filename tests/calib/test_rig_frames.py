@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from calib.rig_frames import FrameTable, pair_photos
+from calib.rig_frames import FrameTable, Pairing, pair_photos
 from sfm.core.errors import Rejected
 
 
-def paired(photos, by="auto") -> FrameTable:
+def paired(photos, by: Pairing = "auto") -> FrameTable:
     table = pair_photos(photos, by)
     assert not isinstance(table, Rejected), table
     return table
