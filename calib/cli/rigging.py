@@ -46,7 +46,7 @@ class CommonOptions:
     """Rig file to write, .toml."""
 
     model: Annotated[str, tyro.conf.arg(metavar="NAME")] = AUTO
-    """Lens model of all cameras: auto (of each what predicts held-out photos best), pinhole, opencv4, opencv5, opencv8,
+    """Lens model of all cameras: auto (of each what predicts held-out photos best), pinhole, opencv, opencv5, opencv8,
     fisheye, eucm …; or of some of them, as in left=opencv5,top=fisheye."""
 
     camera: Annotated[Many, tyro.conf.arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)")] = ()
@@ -211,14 +211,17 @@ def see_rig(
     """
     from calib.cli.calibrating import see_board
     from calib.cli.progress import told
+    from calib.cli.refusals import no_board
     from calib.rig_frames import pair_photos
 
+    cached = not options.no_cache
     seen = {
-        name: see_board(
-            paths, board, threads=options.threads, use_cache=not options.no_cache, observer=told()
-        )
+        name: see_board(paths, board, threads=options.threads, use_cache=cached, observer=told())
         for name, paths in files.items()
-    }  # fmt: skip
+    }
+    for name, one in seen.items():
+        if not one.views:
+            raise no_board(one, files[name])
     digests: dict[str, str] = {}
     for name, one in seen.items():
         if one.digest in digests:
