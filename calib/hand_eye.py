@@ -131,7 +131,8 @@ def calibrate_hand_eye(
         camera: calibrated; it is held.
         turns: of the board that nothing printed on it tells apart; see `board_turns`.
     Returns:
-        `too_few_poses`, `no_rotation`, `one_axis`, `quaternion_order`, `motions_disagree`, `other_unit`,
+        `too_few_poses`, `no_rotation`, `one_axis`, `quaternion_order`, `inverse_poses`, `motions_disagree`,
+        `other_unit`,
         `undetermined`; or what the camera cannot do with the views.
     Raises:
         ValueError: numbers of views and poses differ, or two views have one name.
@@ -194,12 +195,12 @@ def _prepared(
     rows = np.stack([turn.rows for turn in turns])[chosen[o.view_of], o.rows]
     back = Rigid3.stack([turns[k].motion.inverse() for k in chosen.tolist()])
     poses = alone.cams_from_board @ back
-    other = motions_agree(mounts, poses)
+    in_hand = config.setup == "eye_in_hand"
+    other = motions_agree(mounts, poses, hand_is_mount=in_hand)
     if other is not None:
         return other
     observations = dataclasses.replace(o, rows=rows, board=board)
     named = tuple(o.names[v] for v in np.flatnonzero(chosen))
-    in_hand = config.setup == "eye_in_hand"
     return _Problem(board, alone.camera, observations, poses, mounts, alone.sigma_px, named, in_hand)
 
 
@@ -274,8 +275,8 @@ def _linear(
 
 
 def _generalised(
-    y: FloatArray, J: FloatArray, noise: FloatArray, sigma: Vector
-) -> tuple[Vector, FloatArray, FloatArray]:
+    y: FloatArray, J: FloatArray, noise: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The solution (12,), its information (12, 12), and the covariances V_k (V, 6, 6)."""
     V = noise + np.diag(np.repeat(sigma**2, 3))
     weighted = np.linalg.solve(V, J)

@@ -8,8 +8,8 @@ cam_from_board of the camera, both unknowns are in
 Between two poses Z cancels:  B X = X A  with A = G_j G_i⁻¹ and B = C_j C_i⁻¹, the same motion seen by robot and camera.
 So the angles of A and B agree, and their axes are turned by the rotation of X. With α, β the rotation vectors of A, B:
 
-    R_X minimises Σ |β − R α|²                    (Wahba's problem, by SVD)
-    t_X solves    (I − R_B) t_X = t_B − R_X t_A   (least squares, pairs of large angle count more by themselves)
+    R_X minimises Σ |β − R α|                     (Wahba's problem, by SVD with weights)
+    t_X solves    (I − R_B) t_X = t_B − R_X t_A   (the same; pairs of large angle count more by themselves)
 
 and then Z is the mean of G_k⁻¹ X⁻¹ C_k. Two motions about axes that are not parallel are needed: of a camera on a robot
 that turns about one axis only, the place along that axis is open.
@@ -37,7 +37,13 @@ _AGREE = math.radians(5.0)
 """Median difference of the angles of both sides of a motion, beyond which they are not the same motion."""
 _SCALE = 1.5
 """Factor of the robot's translations, beyond which they are in another unit than the board."""
+_NEAR = 0.1
+"""Median distance of boards from where they are predicted, over their distance: below it units are right."""
 _PAIRS = 4000
+_PASSES = 8
+"""Beyond the first, pairs have the weights of least absolute errors: poses of other photos must not lead astray."""
+_FLOOR = 1e-3
+"""Least error that such a weight is taken from: radians, or part of the usual movement."""
 
 
 def turned_enough(mounts: Rotation3) -> Rejected | None:
@@ -82,12 +88,19 @@ def closed_form(mounts_from_world: Rigid3, cams_from_board: Rigid3) -> tuple[Rig
     B = cams_from_board[j] @ cams_from_board[i].inverse()
     alpha, beta = A.rotation.log(), B.rotation.log()
     # A rotation vector of nearly π has no sign to be trusted.
-    weights = np.where(np.maximum(A.rotation.angle, B.rotation.angle) < 0.95 * np.pi, 1.0, 0.0)
-    rotation = _wahba(alpha, beta, weights)
-    R = rotation.matrix
+    usable = np.where(np.maximum(A.rotation.angle, B.rotation.angle) < 0.95 * np.pi, 1.0, 0.0)
+    weights, rotation = usable, Rotation3.identity()
+    for _ in range(_PASSES):
+        rotation = _wahba(alpha, beta, weights)
+        weights = usable / np.maximum(np.linalg.norm(beta - rotation @ alpha, axis=1), _FLOOR)
     left = np.eye(3) - B.rotation.matrix
-    right = B.translation - A.translation @ R.T
-    t = np.linalg.lstsq(left.reshape(-1, 3), right.reshape(-1), rcond=None)[0]
+    right = B.translation - A.translation @ rotation.matrix.T
+    weights, t = np.ones(len(right)), np.zeros(3)
+    for _ in range(_PASSES):
+        root = np.sqrt(weights)[:, None]
+        t = np.linalg.lstsq((root[:, :, None] * left).reshape(-1, 3), (root * right).reshape(-1), rcond=None)[0]
+        off = np.linalg.norm(left @ t - right, axis=1)
+        weights = 1 / np.maximum(off, _FLOOR * max(float(np.median(np.linalg.norm(right, axis=1))), 1e-9))
     cam_from_mount = Rigid3(rotation, t)
     many = Rigid3.stack([cam_from_mount] * len(mounts_from_world))
     return cam_from_mount, mean_motion((many @ mounts_from_world).inverse() @ cams_from_board)
@@ -101,10 +114,14 @@ def _wahba(a: FloatArray, b: FloatArray, weights: Vector) -> Rotation3:
 
 
 def mean_motion(motions: Rigid3) -> Rigid3:
-    """Chordal mean of the rotations, median of the translations."""
-    q = motions.rotation.wxyz
-    _, vectors = np.linalg.eigh(q.T @ q)
-    return Rigid3(Rotation3(vectors[:, -1]), np.median(motions.translation, axis=0))
+    """Mean of the rotations that minimises about the sum of angles, median of the translations."""
+    q, weights = motions.rotation.wxyz, np.ones(len(motions))
+    mean = q[0]
+    for _ in range(_PASSES):
+        _, vectors = np.linalg.eigh((weights[:, None] * q).T @ q)
+        mean = vectors[:, -1]
+        weights = 1 / np.maximum(np.sqrt(np.maximum(1 - (q @ mean) ** 2, 0.0)), _FLOOR)
+    return Rigid3(Rotation3(mean), np.median(motions.translation, axis=0))
 
 
 def consistent_turns(
@@ -130,23 +147,42 @@ def _between(rotations: Rotation3, others: Rotation3 | None = None) -> FloatArra
     return 2 * np.arccos(np.clip(dots, 0.0, 1.0))
 
 
-def motions_agree(mounts_from_world: Rigid3, cams_from_board: Rigid3) -> Rejected | None:
-    """Whether robot and camera describe the same motions; otherwise what may be the reason."""
-    i, j = pairs_of(len(mounts_from_world))
-    seen = _angles(cams_from_board.rotation, i, j)
-    off = float(np.median(np.abs(_angles(mounts_from_world.rotation, i, j) - seen)))
+def motions_agree(mounts_from_world: Rigid3, cams_from_board: Rigid3, *, hand_is_mount: bool) -> Rejected | None:
+    """Whether robot and camera describe the same motions; otherwise what may be the reason.
+
+    Quaternions whose real part is last, taken for first, are those of the inverse rotations but for a turn of both
+    frames: angles do not tell them, axes do, and translations tell which of the two it is.
+    """
+    off, _ = _misfit(mounts_from_world, cams_from_board)
     if off <= _AGREE:
         return None
-    told = f"angles between poses of the robot and of the camera differ by {math.degrees(off):.0f}° (median)"
-    wxyz = mounts_from_world.rotation.wxyz
-    swapped = Rotation3(np.roll(wxyz, 1, axis=1))  # what was read as w x y z is x y z w
-    if np.median(np.abs(_angles(swapped, i, j) - seen)) <= _AGREE:
-        return Rejected("quaternion_order", f"{told}; with quaternions as x, y, z, w they agree")
-    return Rejected("motions_disagree", f"{told}; do photos and poses belong together, and are rotations right?")
+    told = f"motions of robot and camera differ by {math.degrees(off):.0f}° (median)"
+    table = mounts_from_world.inverse() if hand_is_mount else mounts_from_world
+    swapped = Rigid3(Rotation3(np.roll(table.rotation.wxyz, 1, axis=1)), table.translation)
+    others = {
+        "quaternion_order": (swapped, "with quaternions as x, y, z, w they agree"),
+        "inverse_poses": (table.inverse(), "the inverse poses agree: the table holds hand_from_base, or the camera is "
+                          "not on the side that was named"),
+    }  # fmt: skip
+    fits = {}
+    for reason, (poses, _) in others.items():
+        angle, distance = _misfit(poses.inverse() if hand_is_mount else poses, cams_from_board)
+        if angle <= _AGREE:
+            fits[reason] = distance
+    if not fits:
+        return Rejected("motions_disagree", f"{told}; do photos and poses belong together, and are rotations right?")
+    reason = min(fits, key=lambda one: fits[one])
+    return Rejected(reason, f"{told}; {others[reason][1]}")
 
 
-def _angles(rotations: Rotation3, i: np.ndarray, j: np.ndarray) -> Vector:
-    return np.asarray((rotations[j] @ rotations[i].inverse()).angle)
+def _misfit(mounts_from_world: Rigid3, cams_from_board: Rigid3) -> tuple[float, float]:
+    """Median angle and distance between the board's poses and those that the closed form predicts."""
+    X, Z = closed_form(mounts_from_world, cams_from_board)
+    count = len(mounts_from_world)
+    predicted = Rigid3.stack([X] * count) @ mounts_from_world @ Rigid3.stack([Z] * count)
+    apart = cams_from_board.translation - predicted.translation
+    angles = (predicted.rotation @ cams_from_board.rotation.inverse()).angle
+    return float(np.median(angles)), float(np.median(np.linalg.norm(apart, axis=1)))
 
 
 def same_unit(mounts_from_world: Rigid3, cams_from_board: Rigid3, cam_from_mount: Rigid3) -> Rejected | None:
@@ -154,6 +190,9 @@ def same_unit(mounts_from_world: Rigid3, cams_from_board: Rigid3, cam_from_mount
 
     (I − R_B) t_X + s R_X t_A = t_B.
     """
+    _, off = _misfit(mounts_from_world, cams_from_board)
+    if off < _NEAR * float(np.median(np.linalg.norm(cams_from_board.translation, axis=1))):
+        return None
     i, j = pairs_of(len(mounts_from_world))
     A = mounts_from_world[j] @ mounts_from_world[i].inverse()
     B = cams_from_board[j] @ cams_from_board[i].inverse()

@@ -23,6 +23,7 @@ _REMEDIES = {
     "no_rotation": "let the robot tilt and turn the camera between photos",
     "one_axis": "let the robot tilt the camera about a second axis, too",
     "quaternion_order": "write columns qw, qx, qy, qz, in any order, with these names in the first line",
+    "inverse_poses": "give poses as base_from_hand, and --eye-to-hand where the camera stands beside the robot",
     "motions_disagree": "check names in the table; poses must be base_from_hand (see `calib handeye --help`)",
     "other_unit": "write x, y, z in metres, or with --unit mm",
     "undetermined": "let the robot turn the camera more",

@@ -18,8 +18,6 @@ EXAMPLES = (
     "calib stereo left right --board board.toml -o rig.toml --camera left=left.toml --camera right=right.toml",
 )
 
-Source = Annotated[tyro.conf.Positional[str], tyro.conf.arg(help_behavior_hint="")]
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StereoOptions(CommonOptions):
@@ -29,10 +27,10 @@ class StereoOptions(CommonOptions):
     lie from each other's epipolar line and from the same row after rectification, and what was left out and why.
     """
 
-    left: Source
+    left: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LEFT", help_behavior_hint="")]
     """Folder of the left camera's photos, or a pattern in quotes."""
 
-    right: Source
+    right: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RIGHT", help_behavior_hint="")]
     """The same for the right camera."""
 
 
