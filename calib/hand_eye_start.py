@@ -34,11 +34,18 @@ from sfm.core.geometry.rotation import Rotation3
 _LEAST_TURN = math.radians(2.0)
 """Spread of the mount's orientations about the second of its axes, below which they are as good as one axis."""
 _AGREE = math.radians(5.0)
-"""Median difference of the angles of both sides of a motion, beyond which they are not the same motion."""
+"""Angle between a pose and what is predicted, beyond which robot and camera do not describe the same motion."""
+_UNITS = {
+    1e-3: "millimetres were", 1e-2: "centimetres were", 0.0254: "inches were", 0.3048: "feet were",
+    1e3: "a thousandth was", 1e2: "a hundredth was",
+}  # fmt: skip
+"""What was taken for metres, by the factor that mends it."""
+_LIKE = 1.1
+"""Ratio of a factor to that of a unit within which it is this unit."""
 _SCALE = 1.5
 """Factor of the robot's translations, beyond which they are in another unit than the board."""
-_NEAR = 0.1
-"""Median distance of boards from where they are predicted, over their distance: below it units are right."""
+_NEAR = 0.02
+"""Distance of boards from where they are predicted, over that from the camera: below it units are right."""
 _PAIRS = 4000
 _PASSES = 8
 """Beyond the first, pairs have the weights of least absolute errors: poses of other photos must not lead astray."""
@@ -156,7 +163,7 @@ def motions_agree(mounts_from_world: Rigid3, cams_from_board: Rigid3, *, hand_is
     off, _ = _misfit(mounts_from_world, cams_from_board)
     if off <= _AGREE:
         return None
-    told = f"motions of robot and camera differ by {math.degrees(off):.0f}° (median)"
+    told = f"motions of robot and camera differ by {math.degrees(off):.0f}°"
     table = mounts_from_world.inverse() if hand_is_mount else mounts_from_world
     swapped = Rigid3(Rotation3(np.roll(table.rotation.wxyz, 1, axis=1)), table.translation)
     others = {
@@ -176,13 +183,13 @@ def motions_agree(mounts_from_world: Rigid3, cams_from_board: Rigid3, *, hand_is
 
 
 def _misfit(mounts_from_world: Rigid3, cams_from_board: Rigid3) -> tuple[float, float]:
-    """Median angle and distance between the board's poses and those that the closed form predicts."""
+    """Angle and distance of the board's poses from those that the closed form predicts; a quarter is farther off."""
     X, Z = closed_form(mounts_from_world, cams_from_board)
     count = len(mounts_from_world)
     predicted = Rigid3.stack([X] * count) @ mounts_from_world @ Rigid3.stack([Z] * count)
     apart = cams_from_board.translation - predicted.translation
     angles = (predicted.rotation @ cams_from_board.rotation.inverse()).angle
-    return float(np.median(angles)), float(np.median(np.linalg.norm(apart, axis=1)))
+    return float(np.quantile(angles, 0.75)), float(np.quantile(np.linalg.norm(apart, axis=1), 0.75))
 
 
 def same_unit(mounts_from_world: Rigid3, cams_from_board: Rigid3, cam_from_mount: Rigid3) -> Rejected | None:
@@ -205,5 +212,8 @@ def same_unit(mounts_from_world: Rigid3, cams_from_board: Rigid3, cam_from_mount
     factor = float(solution[3] / scale[3])
     if rank < 4 or 1 / _SCALE < factor < _SCALE:
         return None
-    return Rejected("other_unit", f"the robot's translations fit if they are multiplied by {factor:.3g}; they must be "
-                    "in metres")  # fmt: skip
+    told = f"the robot's translations fit best if they are multiplied by {factor:.3g}"
+    for unit, name in _UNITS.items():
+        if 1 / _LIKE < factor / unit < _LIKE:
+            return Rejected("other_unit", f"{told}: {name} taken for metres")
+    return Rejected("motions_disagree", f"{told}; do photos and poses belong together, and are positions right?")

@@ -27,6 +27,8 @@ import cv2
 import numpy as np
 
 from calib import boards
+from calib.hand_eye import calibrate_hand_eye
+from calib.hand_eye_start import closed_form, pairs_of
 from calib.refine_fit import CalibrationConfig
 from calib.refine_views import BoardView
 from calib.rig import RigCalibration, RigConfig, calibrate_rig
@@ -40,7 +42,7 @@ from scripts.bench_calib import chessboard, corners, rounded, timed
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3
+from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
 SETS: dict[str, tuple[str, tuple[int, int], float, float | None]] = {
@@ -57,7 +59,7 @@ NONE = np.zeros(0, np.int64)
 def main() -> int:
     cv2.setNumThreads(1)
     options = parse_options()
-    parts = {"sets": sets, "trials": trials}
+    parts = {"sets": sets, "trials": trials, "handeye": hand_eye}
     rows = list(parts[options.part](options))
     if options.json:
         options.json.write_text(json.dumps(rows, indent=1))
@@ -66,7 +68,7 @@ def main() -> int:
 
 def parse_options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("part", choices=("sets", "trials"))
+    parser.add_argument("part", choices=("sets", "trials", "handeye"))
     parser.add_argument("data", type=Path, nargs="?", default=Path(), help="folder of the sets")
     parser.add_argument("--count", type=int, default=200, help="number of trials")
     parser.add_argument("--repeats", type=int, default=5, help="runs that a time is the median of")
@@ -372,6 +374,115 @@ def rendered(
         RigCamera(f"cam{c}", tuple(views[c]), tuple(frames[c]), LENSES[camera.model], known[c] if known else None)
         for c, camera in enumerate(cameras)
     ]
+
+
+# --- hand and eye -------------------------------------------------------------------------------------------------
+
+ROBOTS = {"exact": (0.0, 0.0), "fine": (1e-4, 5e-5), "usual": (1e-3, 3e-4)}
+"""Standard deviations of a robot, radians and metres on each axis."""
+HAND_FROM_CAM = Rigid3.exp(np.array([0.05, -0.4, 1.2, 0.03, -0.06, 0.11]))
+BASE_FROM_BOARD = Rigid3.exp(np.array([2.9, 0.2, -0.1, 0.6, 0.1, 0.02]))
+
+
+def hand_eye(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A camera on robots of several kinds: errors of closed forms and of ours, and whether it knows its own."""
+    for robot, sigma in ROBOTS.items():
+        for count in (8, 15, 30):
+            yield told({"robot": robot, "poses": count, **hand_eye_judged(sigma, count, options.count)})
+
+
+def hand_eye_judged(sigma: tuple[float, float], count: int, trials: int) -> dict[str, Any]:
+    """Rms errors, radians and mm; ratios of predicted to true errors."""
+    board = chessboard((9, 6), 0.03)
+    board -= (board.min(0) + board.max(0)) / 2
+    forms = {"ours closed": closed_form, "daniilidis": daniilidis, "shah": shah}
+    errors: dict[str, list[np.ndarray]] = {name: [] for name in (*forms, "ours")}
+    sigmas, failed = [], 0
+    for trial in range(trials):
+        rng = np.random.default_rng(trial)
+        views, poses = [], []
+        while len(views) < count:
+            turn = Rotation3.exp(np.append(rng.uniform(-0.6, 0.6, 2), rng.uniform(-1, 1)))
+            pose = Rigid3(turn, np.append(rng.uniform(-0.1, 0.1, 2), rng.uniform(0.4, 0.7)))
+            pixels, valid = LEFT.project(pose @ board)
+            ids = np.flatnonzero(valid & np.all((pixels > 0) & (pixels < [LEFT.width, LEFT.height]), axis=1))
+            if len(ids) >= 20:
+                noisy = pixels[ids] + 0.1 * rng.normal(size=(len(ids), 2))
+                views.append(BoardView(f"{len(views)}", LEFT.width, LEFT.height, ids, noisy))
+                off = Rigid3(Rotation3.exp(sigma[0] * rng.normal(size=3)), sigma[1] * rng.normal(size=3))
+                poses.append(BASE_FROM_BOARD @ pose.inverse() @ HAND_FROM_CAM.inverse() @ off)
+        hands, names = Rigid3.stack(poses), tuple(view.name for view in views)
+        alone = camera_alone(board, RigCamera("c", tuple(views), names, "opencv4", LEFT), CalibrationConfig(), False)
+        found = calibrate_hand_eye(board, views, hands, LEFT)
+        if isinstance(found, Rejected) or isinstance(alone, Rejected):
+            failed += 1
+            continue
+        for name, form in forms.items():
+            errors[name].append(hand_eye_error(form(hands.inverse(), alone.cams_from_board)[0].inverse()))
+        errors["ours"].append(hand_eye_error(found.mount_from_cam))
+        sigmas.append(np.append(found.sigma_rotation, found.sigma_position))
+    row: dict[str, Any] = {"trials": trials, "failed": failed}
+    for name, off in errors.items():
+        square = np.mean(np.square(off), 0)
+        row[name] = [float(f"{np.sqrt(square[:3].sum()):.3g}"), float(f"{1e3 * np.sqrt(square[3:].sum()):.3g}")]
+    known = np.array(errors["ours"])
+    row["within_3_sigma"] = float(np.mean(np.abs(known) < 3 * np.array(sigmas)))
+    ratio = np.sqrt(np.mean(np.square(sigmas), 0) / np.mean(known**2, 0))
+    return row | {"predicted_over_true": [float(f"{r:.3f}") for r in ratio]}
+
+
+def hand_eye_error(hand_from_cam: Rigid3) -> np.ndarray:
+    turn = (hand_from_cam.rotation.inverse() @ HAND_FROM_CAM.rotation).log()
+    return np.append(turn, hand_from_cam.translation - HAND_FROM_CAM.translation)
+
+
+def daniilidis(mounts: Rigid3, cams: Rigid3) -> tuple[Rigid3, None]:
+    """A rival, by dual quaternions (IJRR 1999): the null space of the screws' vector equations."""
+    i, j = pairs_of(len(mounts))
+    rows = []
+    A, B = mounts[j] @ mounts[i].inverse(), cams[j] @ cams[i].inverse()
+    for k in range(len(A)):
+        (a, ad), (b, bd) = dual(A[k]), dual(B[k])
+        top = np.concatenate([(b - a)[1:, None], skew((a + b)[1:]), np.zeros((3, 4))], axis=1)
+        low = np.concatenate([(bd - ad)[1:, None], skew((ad + bd)[1:]), (b - a)[1:, None], skew((a + b)[1:])], axis=1)
+        rows += [top, low]
+    u, v = np.linalg.svd(np.concatenate(rows))[2][-2:]
+    # λ₁ u + λ₂ v with |q| = 1 and q · q' = 0.
+    uu, uv, vv = u[:4] @ u[4:], u[:4] @ v[4:] + v[:4] @ u[4:], v[:4] @ v[4:]
+    roots = np.real(np.roots([uu, uv, vv]))
+    best = max(roots, key=lambda s: s * s * u[:4] @ u[:4] + 2 * s * u[:4] @ v[:4] + v[:4] @ v[:4])
+    q = best * u + v
+    q = q / np.linalg.norm(q[:4])
+    turn = Rotation3(q[:4])
+    return Rigid3(turn, 2 * product(q[4:], q[:4] * [1, -1, -1, -1])[1:]), None
+
+
+def dual(motion: Rigid3) -> tuple[np.ndarray, np.ndarray]:
+    q = np.array(motion.rotation.wxyz)
+    q = q if q[0] > 0 else -q
+    return q, 0.5 * product(np.append(0.0, motion.translation), q)
+
+
+def product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    return np.append(p[0] * q[0] - p[1:] @ q[1:], p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))
+
+
+def shah(mounts: Rigid3, cams: Rigid3) -> tuple[Rigid3, Rigid3]:
+    """A rival, linear in both unknowns at once (J. Mechanisms and Robotics 2013): C_k = X G_k Z."""
+    G, C = mounts.rotation.matrix, cams.rotation.matrix
+    # G Z = X⁻¹ C: the columns of R_Z and of R_X⁻¹, one below the other, are a pair of singular vectors.
+    U, _, Vt = np.linalg.svd(np.sum([np.kron(c, g) for c, g in zip(C, G, strict=True)], axis=0))
+    RZ, inverse = (rotation_of(vector.reshape(3, 3).T) for vector in (Vt[0], U[:, 0]))
+    RX = inverse.T
+    left = np.concatenate([np.broadcast_to(np.eye(3), G.shape), RX @ G], axis=2).reshape(-1, 6)
+    right = (cams.translation - mounts.translation @ RX.T).ravel()
+    t = np.linalg.lstsq(left, right, rcond=None)[0]
+    return Rigid3(Rotation3.from_matrix(RX), t[:3]), Rigid3(Rotation3.from_matrix(RZ), t[3:])
+
+
+def rotation_of(matrix: np.ndarray) -> np.ndarray:
+    U, _, Vt = np.linalg.svd(matrix * np.sign(np.linalg.det(matrix)))
+    return U @ Vt
 
 
 if __name__ == "__main__":
