@@ -90,7 +90,7 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
     observer = told()
     with kernels_announced(observer):
         seen, table = see_rig(files, board, options)
-        cameras = rig_cameras(seen, table, options)
+        cameras = rig_cameras(seen, files, table, options)
         ranked = _calibrated(board, cameras, board_turns(board), options)
     if isinstance(ranked, Rejected):
         raise _refusal(ranked, seen)
@@ -238,18 +238,20 @@ def _names(seen: Sightings) -> list[str]:
     return [*(view.name for view in seen.views), *(view.name for view in seen.left_out)]
 
 
-def rig_cameras(seen: Mapping[str, Sightings], table: FrameTable, options: CommonOptions) -> list[RigCamera]:
+def rig_cameras(
+    seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]], table: FrameTable, options: CommonOptions
+) -> list[RigCamera]:
     """As the solver wants them; lens models that are to be chosen are.
 
     Raises:
-        ReconstructionError: no lens model can be had for a camera.
+        SfmError: no lens model can be had for a camera.
     """
     from calib.rig_views import RigCamera
 
     names = tuple(seen)
     lenses, known = lenses_of(options, names), known_cameras(options, names)
     lenses |= {name: _lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
-    lenses |= _chosen({name: one for name, one in seen.items() if lenses[name] == AUTO and one.views}, options.seed)
+    lenses |= _chosen({name: one for name, one in seen.items() if lenses[name] == AUTO}, files, options.seed)
     return [
         RigCamera(
             name,
@@ -262,12 +264,13 @@ def rig_cameras(seen: Mapping[str, Sightings], table: FrameTable, options: Commo
     ]
 
 
-def _chosen(seen: Mapping[str, Sightings], seed: int) -> dict[str, str]:
+def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]], seed: int) -> dict[str, str]:
     """The lens model of each camera that predicts held-out views best.
 
     Cameras with images of one size are likely of one make: those with perspective lenses get the richest model that one
     of them needs.
     """
+    from calib.cli.refusals import no_camera
     from calib.refine_fit import CalibrationConfig
     from calib.refine_lenses import Lens, lens_by_name
     from calib.uncertainty_holdout import choose_lens
@@ -277,7 +280,7 @@ def _chosen(seen: Mapping[str, Sightings], seed: int) -> dict[str, str]:
         # Of all shapes this costs least where it is not needed, and takes most of a bend.
         ranked = choose_lens(one.points3D, one.views, CalibrationConfig(shape="paraboloid"), seed=seed)
         if isinstance(ranked, Rejected):
-            raise _refusal(Rejected(ranked.reason, f"{name}: {ranked.detail}"), seen)
+            raise no_camera(one, ranked, files[name])
         found[name] = lens_by_name(ranked[0].lens)
     sizes = {name: (one.views[0].width, one.views[0].height) for name, one in seen.items()}
 
