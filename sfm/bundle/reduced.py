@@ -20,6 +20,7 @@ import numpy as np
 
 from sfm.bundle import _layout_kernels as kernels
 from sfm.bundle.layout import Layout
+from sfm.bundle.marginals import Marginals, marginals
 from sfm.bundle.problem import SolverChoice
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import Workers, machine_bytes
@@ -60,7 +61,7 @@ class SolverPlan(NamedTuple):
 def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: SolverChoice) -> SolverPlan:
     """Chooses a solver for the rows of `layout`, of whose unknowns (rows, 6) some are `held`."""
     unknowns = held.ravel()
-    if layout.rows <= _FULL_ROWS and choice in ("auto", "dense"):
+    if layout.rows <= _FULL_ROWS and choice in ("auto", "dense", "exact"):
         return _plan("dense", BlockPattern.full(layout.rows), forecast_dense(unknowns))
     pattern = layout.pattern(terms.rows, terms.columns)
     match choice:
@@ -72,6 +73,8 @@ def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: Solver
             return _iterative(layout, pattern, unknowns)
     forecast = forecast_cheapest(pattern, unknowns)
     plan = _plan(forecast.kind, pattern, forecast)
+    if choice == "exact":
+        return plan
     too_slow = forecast.seconds > _PRODUCTS_PER_STEP * _product_seconds(layout)
     return _iterative(layout, pattern, unknowns) if too_slow or plan.bytes > machine_bytes() / 2 else plan
 
@@ -167,14 +170,13 @@ class ReducedSystem:
             delta = self._solver.solve(side)
         return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
 
-    def matrix(self) -> FloatArray:
-        """S (6 rows, 6 rows) in full; where it is formed, all of its blocks."""
-        pattern, size = self.plan.pattern, self._layout.rows
-        S = np.zeros((size, size, BLOCK, BLOCK))
-        rows = np.repeat(np.arange(size), np.diff(pattern.offsets))
-        S[rows, pattern.columns] = self._blocks[:, :, :BLOCK]
-        lower = np.tril(S.transpose(0, 2, 1, 3).reshape(BLOCK * size, BLOCK * size))
-        return lower + np.tril(lower, -1).T
+    def inverse(self, motions: FloatArray) -> Marginals | int:
+        """Blocks of S⁻¹ as last eliminated, all of them formed; see `marginals`. Overwrites S."""
+        solver = self._solver
+        if self.plan.kind == "iterative":
+            raise ValueError("an inverse needs a factor of S, and gradients have none")
+        free, blocks = ~self._held.ravel(), self._blocks[:, :, :BLOCK].copy()
+        return marginals(self.plan.pattern, blocks, solver, free, motions, self._workers.threads)
 
     def _eliminate_rows(self, rows: tuple[int, int]) -> None:
         pattern = self.plan.pattern

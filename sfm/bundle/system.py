@@ -27,6 +27,7 @@ from sfm.bundle import _kernels as kernels
 from sfm.bundle.gauge import HeldPoints
 from sfm.bundle.knowledge import Knowledge
 from sfm.bundle.layout import Layout
+from sfm.bundle.marginals import Marginals
 from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
 from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
@@ -161,13 +162,21 @@ class BundleSystem:
         return self.costs
 
     def information(self, held: HeldPoints | None = None) -> Information:
-        """What the problem says about its parameters, as last linearised; points may be held in some directions."""
+        """What the problem says about its points, as last linearised; these may be held in some directions."""
         self._run(lambda job: invert_blocks(*job, self._V, 0.0, self._M), self.layout.point_chunks)
         if held is not None:
             for point, basis in zip(held.points, held.bases, strict=True):
                 self._M[point] = _within(self._V[point], basis)
         self._reduced.eliminate(self._row_centers(), self._state.points3D, self._M, self._g)
-        return Information(self._reduced.matrix(), self._couplings, self._row_centers(), self._V, self._M)
+        return Information(self._couplings, self._row_centers(), self._V, self._M)
+
+    def inverse(self, motions: FloatArray) -> Marginals | int:
+        """Blocks of the inverse of what `information` has left of poses and parameters; see `marginals`.
+
+        Args:
+            motions: (6 rows, m) that cost nothing.
+        """
+        return self._reduced.inverse(motions)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
@@ -244,14 +253,13 @@ def _within(information: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 class Information(NamedTuple):
-    """The reduced matrix (6 rows, 6 rows) without damping, and what was eliminated: see `sfm.core.optim.schur`.
+    """What was eliminated, without damping: see `sfm.core.optim.schur`.
 
     Attributes:
         centers: (S, 3) of the frames by row.
         V, M: (P, 6) information about each point alone, and its inverse.
     """
 
-    reduced: np.ndarray
     couplings: Couplings
     centers: np.ndarray
     V: np.ndarray

@@ -15,6 +15,7 @@ from sfm.bundle import (
     BundleResult,
     adjust,
     covariance,
+    covariance_bytes,
     free_params_of,
     problem_from_reconstruction,
     squared_errors,
@@ -185,7 +186,7 @@ def refine_model(
         reconstruction = transformed(reconstruction, there)
     problem = _problem(reconstruction, config, priors)
     if with_covariance:
-        _check_memory(6 * int(problem.free_poses.sum()) + int(problem.free_params.sum()))
+        _check_memory(covariance_bytes(problem, config.bundle))
     result = adjust(problem, config.bundle, threads=threads, observer=observer)
     if result.invalid == len(problem.obs_images):
         raise InputError("no observation of this model has a projection; there is nothing to adjust")
@@ -263,8 +264,8 @@ def _rms(problem: BundleProblem) -> float:
     return float(np.sqrt(np.nanmean(squared_errors(problem))))
 
 
-def _check_memory(parameters: int) -> None:
-    needed, free = 32 * parameters**2, free_memory_bytes()
+def _check_memory(needed: int) -> None:
+    free = free_memory_bytes()
     if free is not None and needed > free:
         raise InputError(
             f"standard deviations take {needed / 1e9:.0f} GB of memory here, and {free / 1e9:.0f} GB are free",

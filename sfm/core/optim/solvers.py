@@ -51,6 +51,18 @@ class ReducedSolver(Protocol):
         ...
 
 
+class FactorSolver(ReducedSolver, Protocol):
+    """A solver by an exact factor, which also tells what is in the inverse."""
+
+    def least_pivot(self) -> float:
+        """The least pivot of the factor, the square of an entry on its diagonal; inf where nothing is free."""
+        ...
+
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
     """What a solver takes for each factorisation, known before any of it is taken.
