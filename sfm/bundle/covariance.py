@@ -56,7 +56,7 @@ class BundleCovariance(Value):
         poses: (I, 6, 6) of the tangent (ω, υ) of `cams_from_world`, radians and scene units, update on the left; zero
             where a pose is constant or held, NaN where no observation sees it.
         centers: (I, 3, 3) of the camera centres in the world.
-        params: (C, 12, 12) of the camera parameters; zero where they are constant.
+        params: (C, 12, 12) of the camera parameters; zero where they are constant or on a bound, which holds them.
         points3D: (P, 3, 3); zero where a point is constant, NaN where its views do not determine it.
         variance_factor: twice the cost over the degrees of freedom. Where the stated standard deviations are only
             proportional to the true ones, all covariances times this are right; see `scaled`.
@@ -90,6 +90,7 @@ def covariance(
         `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave
         open as detail.
     """
+    problem = dataclasses.replace(problem, free_params=problem.free_params & ~problem.at_bounds)
     system, _ = system_of(problem, _with_factor(config), threads)
     layout, (cost, _) = system.layout, system.linearize()
     held = held_by_three_points(problem, layout) if config.gauge == "three_points" else None
@@ -175,17 +176,19 @@ def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: Marginals) -> tu
     centre to its own, and μ its sensor's tangent.
     """
     poses, count = problem.cams_from_world, len(layout.image_slot)
-    R, arms = poses.rotation.matrix, poses.center - frame_centers(problem)[layout.image_frame]
+    unseen = np.bincount(layout.image, minlength=count) == 0  # and perhaps not finite
+    ends = (poses.center, frame_centers(problem)[layout.image_frame])
+    here, frame = (np.where(unseen[:, None], 0.0, place) for place in ends)
+    R, arms = poses.rotation.matrix, here - frame
     J = np.zeros((count, 6, 6))
     J[:, :3, :3] = J[:, 3:, 3:] = R
-    J[:, 3:, :3] = -R @ skew(np.where(np.isfinite(arms), arms, 0.0))
+    J[:, 3:, :3] = -R @ skew(arms)
     frames, sensors = layout.image_slot.astype(np.int64), _sensor_rows(layout)
     crossed = J @ sigma.between(frames, sensors)
     blocks = J @ sigma.between(frames, frames) @ J.transpose(0, 2, 1)
     blocks += crossed + crossed.transpose(0, 2, 1) + sigma.between(sensors, sensors)
     centers = R.transpose(0, 2, 1) @ blocks[:, 3:, 3:] @ R
-    unseen = (np.bincount(layout.image, minlength=count) == 0) & problem.free_poses
-    blocks[unseen], centers[unseen] = np.nan, np.nan
+    blocks[unseen & problem.free_poses], centers[unseen & problem.free_poses] = np.nan, np.nan
     return blocks, centers
 
 

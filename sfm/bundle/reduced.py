@@ -26,6 +26,7 @@ from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import Workers, machine_bytes
 from sfm.core.optim._block_kernels import WIDTH
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.box import Box, step_in_box
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
 from sfm.core.optim.preconditioners import clusters_of, restricted_pattern
 from sfm.core.optim.schur import Couplings, eliminate, multiply
@@ -109,6 +110,20 @@ def _product_seconds(layout: Layout) -> float:
     return _PRODUCT_SECONDS_PER_COUPLING * (len(layout.slot) + 3 * len(layout.shared_slot))
 
 
+class ReducedStep(NamedTuple):
+    """A step of poses and shared parameters.
+
+    Attributes:
+        delta: (rows, 6).
+        sides: (K,) on which side of a box its entries are; see `sfm.core.optim.box`.
+        decrease: what the model promises beyond ½ δᵀ (λD δ − g), which holds where a box does not bound the step.
+    """
+
+    delta: FloatArray
+    sides: np.ndarray
+    decrease: float
+
+
 class ReducedSystem:
     """S, its right-hand side and the solver; lives as long as one adjustment.
 
@@ -154,21 +169,40 @@ class ReducedSystem:
         self._gradient_of_points = g
         self._workers.map(self._eliminate_rows, self._ranges)
 
-    def solve(self, damping: float) -> FloatArray | None:
-        """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
+    def solve(self, damping: float, box: Box | None = None) -> ReducedStep | None:
+        """δ (rows, 6) with (S + λD) δ = side, in a box the best; None where S + λD is not positive definite or δ not
+        finite."""
         self.scaling = damping * self._marquardt_diagonal()
         if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._workers.threads):
             return None
         side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
-        if self.plan.kind == "iterative":
-            found = conjugate_gradients(
-                self._multiplied, side, self._solver.solve, model_tolerance=_MODEL_TOLERANCE,
-                residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
-            )  # fmt: skip
-            delta = found.x if found.iterations or not side.any() else np.full(len(side), np.nan)
-        else:
-            delta = self._solver.solve(side)
-        return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
+        # What follows from a rough solution for a box is no minimum of the model in any space.
+        delta = self._solved(side, _MODEL_TOLERANCE if box is None else 0.0)
+        if not np.isfinite(delta).all():
+            return None
+        if box is None:
+            return ReducedStep(delta.reshape(-1, BLOCK), np.zeros(0, np.int64), 0.0)
+        step = step_in_box(delta, self._inverse_column, box)
+        if not np.isfinite(step.x).all():
+            return None
+        decrease = -0.5 * float((step.multipliers * step.x[box.entries]).sum())
+        return ReducedStep(step.x.reshape(-1, BLOCK), step.sides, decrease)
+
+    def _solved(self, side: FloatArray, model_tolerance: float) -> FloatArray:
+        """(6 rows,) with the factor, or by gradients; NaN where these get nowhere."""
+        if self.plan.kind != "iterative":
+            return self._solver.solve(side)
+        found = conjugate_gradients(
+            self._multiplied, side, self._solver.solve, model_tolerance=model_tolerance,
+            residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
+        )  # fmt: skip
+        return found.x if found.iterations or not side.any() else np.full(len(side), np.nan)
+
+    def _inverse_column(self, entry: int) -> FloatArray:
+        """That of (S + λD)⁻¹."""
+        side = np.zeros(self._held.size)
+        side[entry] = 1.0
+        return self._solved(side, 0.0)
 
     def inverse(self, motions: FloatArray) -> Marginals | int:
         """Blocks of S⁻¹ as last eliminated, all of them formed; see `marginals`. Overwrites S."""

@@ -68,6 +68,33 @@ def test_a_model_of_colmap_is_refined_to_what_ceres_makes_of_it(sfm, disturbed, 
     assert "cx" not in cameras["sigmas"]
 
 
+def test_a_focal_length_that_ends_on_a_bound_is_named(sfm, disturbed, tmp_path):
+    present = read_model(disturbed).cameras[1].params[0]
+    bounds = ("--bounds", "focal=0.995:,distortion=-1:1")
+    result = sfm("refine", disturbed, "-o", "bounded", "--refine", "focal,distortion", "--sigmas", *bounds)
+    assert result.returncode == 0, result.stderr
+    assert "camera 1: f ended on a bound" in result.stdout
+    assert read_model(tmp_path / "bounded").cameras[1].params[0] == 0.995 * present
+    result = sfm("refine", disturbed, "-o", "within", "--refine", "focal", "--bounds", "focal=0.9:1.1", "--json")
+    assert "at_bounds" not in json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "told"),
+    [
+        ("focal=1.2:0.8", "does not know 'focal=1.2:0.8'"),
+        ("focal=a:b", "does not know 'focal=a:b'"),
+        ("zoom=1:2", "does not know 'zoom=1:2'"),
+        ("focal=1.1:1.2", "must contain 1"),
+        ("pp=-5:5", "may not change"),
+        ("distortion=0.5:1", "out of its bounds 0.5..1"),
+    ],
+)
+def test_bounds_that_cannot_be_are_refused(sfm, disturbed, bounds, told):
+    result = sfm("refine", disturbed, "-o", "refused", "--refine", "focal,distortion", "--bounds", bounds)
+    assert_one_line(result, 3 if "out of" in told else 2, told)
+
+
 def test_what_is_held_stays_to_the_last_bit(disturbed):
     model = read_model(disturbed)
     held = refine_model(model, RefinementConfig(intrinsics=(), points=False)).reconstruction
