@@ -18,7 +18,7 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
 from sfm.core.optim.losses import Loss
 
-SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "exact", "iterative"]
+SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "exact", "cholmod", "iterative"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -193,8 +193,8 @@ class BundleConfig:
     were, or two points and the plane through them and a third, or leave the scene wherever the steps took it.
     Covariances are relative to these, or spread over all."""
     solver: SolverChoice = "auto"
-    """How the reduced system is solved: by a dense or a sparse factor, the faster of these (exact), or by conjugate
-    gradients; see `reduced`."""
+    """How the reduced system is solved: by a dense or a sparse factor, the faster of these (exact), a sparse one of
+    CHOLMOD, where scikit-sparse is installed, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
         if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):

@@ -2,6 +2,7 @@
 
     dense       Cholesky factor of all of S
     sparse      Cholesky factor of the blocks that points couple, in an order that keeps it sparse
+    cholmod     the same by CHOLMOD, where it is installed
     iterative   conjugate gradients; S is known by its products alone (`schur.multiply`), and only what the
                 preconditioner needs of it is formed: the blocks of pairs of rows within clusters
 
@@ -27,10 +28,19 @@ from sfm.core.execution import Workers, machine_bytes
 from sfm.core.optim._block_kernels import WIDTH
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.box import Box, step_in_box
+from sfm.core.optim.cholmod import CholmodCholesky
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
 from sfm.core.optim.preconditioners import clusters_of, restricted_pattern
 from sfm.core.optim.schur import Couplings, eliminate, multiply
-from sfm.core.optim.solvers import Forecast, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
+from sfm.core.optim.solvers import (
+    Forecast,
+    forecast_cheapest,
+    forecast_cholmod,
+    forecast_dense,
+    forecast_sparse,
+    make_solver,
+)
+from sfm.core.optional import import_cholmod
 
 _FLOOR = 1e-8
 """Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
@@ -48,7 +58,7 @@ class SolverPlan(NamedTuple):
     """What was chosen to solve the reduced system, before any of its memory is taken.
 
     Attributes:
-        kind: dense, sparse or iterative.
+        kind: dense, sparse, cholmod or iterative.
         pattern: the blocks of S that are formed; forecast: of what factors them.
         bytes: for S and its factor.
     """
@@ -70,6 +80,9 @@ def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: Solver
             return _plan("dense", pattern, forecast_dense(unknowns))
         case "sparse":
             return _plan("sparse", pattern, forecast_sparse(pattern, unknowns))
+        case "cholmod":
+            import_cholmod()  # fails here rather than after a forecast
+            return _plan("cholmod", pattern, forecast_cholmod(pattern, unknowns))
         case "iterative":
             return _iterative(layout, pattern, unknowns)
     forecast = forecast_cheapest(pattern, unknowns)
@@ -207,8 +220,8 @@ class ReducedSystem:
     def inverse(self, motions: FloatArray) -> Marginals | int:
         """Blocks of S⁻¹ as last eliminated, all of them formed; see `marginals`. Overwrites S."""
         solver = self._solver
-        if self.plan.kind == "iterative":
-            raise ValueError("an inverse needs a factor of S, and gradients have none")
+        if self.plan.kind == "iterative" or isinstance(solver, CholmodCholesky):
+            raise ValueError(f"an inverse needs a dense or a sparse factor of S, not {self.plan.kind}")
         free, blocks = ~self._held.ravel(), self._blocks[:, :, :BLOCK].copy()
         return marginals(self.plan.pattern, blocks, solver, free, motions, self._workers.threads)
 

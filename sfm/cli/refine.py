@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
@@ -32,6 +32,7 @@ EXAMPLES = (
 _FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="")
 _PX = tyro.conf.arg(metavar="PX", help_behavior_hint="")
 _UNITS = tyro.conf.arg(metavar="UNITS", help_behavior_hint="")
+_Solver: TypeAlias = Literal["auto", "dense", "sparse", "cholmod", "iterative"]
 _GPS_SIGMA_M = 5.0
 _KINDS: dict[str, Intrinsics] = {"focal": "focal", "pp": "principal_point", "distortion": "extra"}
 _SENSORS = "sensors"
@@ -90,8 +91,9 @@ class RefineOptions:
     tolerance: Annotated[float, tyro.conf.arg(metavar="PART")] = 1e-8
     """Stop where a full step lowers the cost by less than this part."""
 
-    solver: Annotated[Literal["auto", "dense", "sparse", "iterative"], tyro.conf.arg(metavar="NAME")] = "auto"
-    """How the reduced system is solved: dense, sparse (factors), iterative (conjugate gradients); auto: the fastest."""
+    solver: Annotated[_Solver, tyro.conf.arg(metavar="NAME")] = "auto"
+    """How the reduced system is solved: dense, sparse (factors), cholmod (a sparse factor of SuiteSparse, if
+    scikit-sparse is installed), iterative (conjugate gradients); auto: the fastest without cholmod."""
 
     positions: Annotated[Path | None, _FILE] = None
     """Where photos were taken: name,x,y,z or name,latitude,longitude,altitude; also sx,sy,sz."""

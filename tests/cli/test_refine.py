@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 
@@ -300,3 +301,10 @@ def test_measurements_that_will_not_do_are_told(sfm, disturbed, surveyed, tmp_pa
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--marks", table), 2, "of control points")
     (tmp_path / "bad.csv").write_text("name,x,y\na,1,2\n")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", "bad.csv"), 3, "lacks z")
+
+
+def test_a_solver_that_is_not_installed_is_a_missing_dependency(sfm, disturbed):
+    if importlib.util.find_spec("sksparse"):
+        pytest.skip("scikit-sparse is installed")
+    result = sfm("refine", disturbed, "-o", "refined", "--solver", "cholmod")
+    assert_one_line(result, 6, r"CHOLMOD cannot be imported.*scikit-sparse<0\.5")
