@@ -187,7 +187,8 @@ class BundleConfig:
     relative_cost_tolerance: float = 1e-6
     """Stop where a full step lowers the cost by less than this part."""
     gradient_tolerance: float = 1e-10
-    """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
+    """Stop where the residuals are as good as perpendicular to what any parameter does to them: where the cosine of no
+    such angle, |g| / √(2 F H) of a gradient and a diagonal entry, exceeds this. Without a unit."""
     gauge: Literal["two_cameras", "three_points", "free"] = "two_cameras"
     """Where the data leave the frame of the scene open: keep one pose and one coordinate of a second centre as they
     were, or two points and the plane through them and a third, or leave the scene wherever the steps took it.

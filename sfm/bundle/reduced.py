@@ -182,6 +182,11 @@ class ReducedSystem:
         self._gradient_of_points = g
         self._workers.map(self._eliminate_rows, self._ranges)
 
+    @property
+    def diagonal(self) -> FloatArray:
+        """(rows, 6) of the normal matrix, as last eliminated."""
+        return self._diagonal
+
     def solve(self, damping: float, box: Box | None = None) -> ReducedStep | None:
         """δ (rows, 6) with (S + λD) δ = side, in a box the best; None where S + λD is not positive definite or δ not
         finite."""

@@ -38,7 +38,7 @@ from sfm.core.execution import Workers
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
-from sfm.core.optim.levenberg_marquardt import Trial
+from sfm.core.optim.levenberg_marquardt import Trial, steepness
 from sfm.core.optim.losses import Loss, loss_id
 from sfm.core.optim.schur import Couplings, invert_blocks
 
@@ -65,6 +65,7 @@ class BundleSystem:
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self.free_points = problem.free_points.copy()
         self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
+        self._cost, self._flat = 0.0, config.gradient_tolerance
         self._state = _State.of(problem)
         self._trial, self._places = self._state.copy(), _Places.of(layout)
 
@@ -157,7 +158,8 @@ class BundleSystem:
         self._reduced.take_over(sums, blocks, gradient)
         reduced = self._bounds.projected(self._reduced.gradient, now.params)
         largest = max(np.abs(reduced).max(initial=0.0), np.abs(self._g).max(initial=0.0))
-        return float(cost), float(largest)
+        self._cost = float(cost)
+        return self._cost, float(largest)
 
     def evaluate(self, loss: Loss) -> FloatArray:
         """ρ of the observations (n,) by points, at the current parameters; NaN where there is no projection."""
@@ -212,7 +214,16 @@ class BundleSystem:
         decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
         decrease += bound_decrease
         norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
-        return Trial(float(cost), float(decrease), math.sqrt(step + _squared(delta)), math.sqrt(norm))
+        step_norm, norm = math.sqrt(step + _squared(delta)), math.sqrt(norm)
+        return Trial(float(cost), float(decrease), step_norm, norm, self._steepness())
+
+    def _steepness(self) -> float:
+        """See `levenberg_marquardt`. Points, which are many, are looked at where the rest is flat at least."""
+        gradient = self._bounds.projected(self._reduced.gradient, self._state.params)
+        of_rows = steepness(gradient, self._reduced.diagonal, self._cost)
+        if of_rows > self._flat:
+            return of_rows
+        return max(of_rows, steepness(self._g, self._V[:, [0, 3, 5]], self._cost))
 
     def accept(self) -> None:
         """Makes the last trial current."""

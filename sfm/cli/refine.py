@@ -301,7 +301,7 @@ def _listed(words: str, known: Sequence[str], option: str) -> list[str]:
 
 _REASONS = {
     "relative_cost": "a full step hardly lowered the cost",
-    "gradient": "the gradient vanished",
+    "gradient": "the gradient vanished (residuals are perpendicular to what parameters do to them)",
     "step": "steps became as small as rounding errors",
     "max_iterations": "NOT CONVERGED: the limit of iterations was reached",
     "no_free_parameters": "nothing was free to change",

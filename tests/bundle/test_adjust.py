@@ -271,3 +271,29 @@ def test_cholmod_takes_the_same_steps_as_our_sparse_factor(make_problem, perturb
     assert isinstance(found, BundleCovariance)
     assert isinstance(expected, BundleCovariance)
     np.testing.assert_allclose(found.params, expected.params, rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
+def test_the_gradient_stops_a_scene_in_any_units(make_problem, perturbed, rng, loss):
+    problem = perturbed(make_problem(rng, images=6, points=80, noise_px=0.5, free_params=(0, 1)), rng)
+    config = BundleConfig(loss=loss, relative_cost_tolerance=1e-30, gradient_tolerance=1e-7)
+    plain = adjust(problem, config)
+    assert plain.reason == "gradient"
+    poses, sigmas = problem.cams_from_world, np.full(len(problem.obs_images), 1e-4)
+    larger = dataclasses.replace(
+        problem, cams_from_world=Rigid3(poses.rotation, 1e3 * poses.translation), points3D=1e3 * problem.points3D
+    )
+    weighed = dataclasses.replace(problem, obs_sigmas=sigmas)
+    for other, scale in ((larger, 1.0), (weighed, 1e4)):
+        result = adjust(other, dataclasses.replace(config, loss_scale_px=scale))
+        assert result.reason == "gradient"
+        assert result.iterations == plain.iterations
+
+
+def test_the_gradient_of_points_alone_stops_too(make_problem, perturbed, rng):
+    problem = make_problem(rng, images=6, points=40, noise_px=0.5)
+    problem = dataclasses.replace(problem, free_poses=np.zeros(6, bool))
+    result = adjust(perturbed(problem, rng), BundleConfig(relative_cost_tolerance=1e-30, gradient_tolerance=1e-7))
+    assert result.reason == "gradient"
+    again = adjust(result.problem, BundleConfig(gradient_tolerance=1e-7))
+    assert (again.reason, again.iterations) == ("gradient", 0)
