@@ -5,8 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import WIDTH
-from sfm.core.optim._schur_kernels import fill_coupling
+from sfm.core.optim._block_kernels import WIDTH, set_coupling
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -25,7 +24,7 @@ def point_covariances(
     for p in range(len(out)):
         widest = max(widest, 6 * (starts[p + 1] - starts[p] + shared_starts[p + 1] - shared_starts[p]))
     rows, T, U = np.empty(widest, np.int64), np.empty((3, widest)), np.empty((3, widest))
-    m, w = np.empty((3, 3)), np.empty((3, WIDTH))
+    m, w = np.empty((3, 3)), np.empty((1, 3, WIDTH))
     for p in range(len(out)):
         if not free[p]:
             continue
@@ -36,10 +35,11 @@ def point_covariances(
         size = 0
         for e in range(starts[p], starts[p + 1]):
             s = slot[e]
-            fill_coupling(N[e], X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2], w)
+            u = (X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2])
+            set_coupling(w, 0, N, e, u)
             for a in range(6):
                 rows[size] = 6 * s + a
-                T[0, size], T[1, size], T[2, size] = w[0, a], w[1, a], w[2, a]
+                T[0, size], T[1, size], T[2, size] = w[0, 0, a], w[0, 1, a], w[0, 2, a]
                 size += 1
         for e in range(shared_starts[p], shared_starts[p + 1]):
             for a in range(6):
