@@ -59,9 +59,7 @@ def residual_field_figure(found: Calibration) -> str:
     )  # fmt: skip
 
 
-def cell_means(
-    points2D: FloatArray, values: FloatArray, camera: Camera, across: int
-) -> tuple[FloatArray, FloatArray]:
+def cell_means(points2D: FloatArray, values: FloatArray, camera: Camera, across: int) -> tuple[FloatArray, FloatArray]:
     """(m, 2) means of values (n, 2) over square cells with enough corners, and the cells' centres (m, 2) in px."""
     size = camera.width / across
     down = max(1, math.ceil(camera.height / size))
@@ -83,7 +81,7 @@ def residual_scatter_figure(found: Calibration) -> str:
     inside = residuals[np.all(np.abs(residuals) < reach, axis=1)]
     beyond = len(residuals) - len(inside)
     parts = [svg.dot(frame, x, y, 1.3, svg.ACCENT, opacity=0.5) for x, y in inside]
-    parts += [svg.ring(frame, 0, 0, k * sigma, svg.WARNING) for k in (1, 2, 3)]
+    parts += [svg.ring(frame, 0.0, 0.0, k * sigma, svg.WARNING) for k in (1, 2, 3)]
     title = f"Residuals; rings at 1, 2, 3 σ, σ = {sigma:.4f} px" + (f"; {beyond} lie beyond" if beyond else "")
     return svg.figure(frame, title, [*parts, *svg.ticks(frame)], across="px")
 
@@ -113,7 +111,7 @@ def board_figure(found: Calibration) -> str:
     margin = 0.08 * float(np.max(high - low))
     frame = Frame(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
     if found.shape.kind == "flat":
-        parts = [svg.dot(frame, x, y, 3, svg.ACCENT) for x, y, _ in points]
+        parts = [svg.dot(frame, x, y, 3.0, svg.ACCENT) for x, y, _ in points]
         return svg.figure(frame, "Board: taken to be flat and exactly as designed", parts)
     bottom, top = float(moved[:, 2].min()), float(moved[:, 2].max())
     sideways = np.hypot(*moved[:, :2].T)
@@ -121,7 +119,7 @@ def board_figure(found: Calibration) -> str:
     parts = []
     for point, shift in zip(points, moved, strict=True):
         parts.append(
-            svg.dot(frame, point[0], point[1], 5, svg.color_of(shift[2], bottom, top), title=f"z {shift[2]:+.3f} mm")
+            svg.dot(frame, point[0], point[1], 5.0, svg.color_of(shift[2], bottom, top), title=f"z {shift[2]:+.3f} mm")
         )
         if sideways.max() > 0:
             parts.append(svg.arrow(frame, point[:2], shift[:2] * gain, svg.INK))
@@ -143,10 +141,10 @@ def views_figure(found: Calibration) -> str:
         left, width = frame.x(v + 0.1), 0.8 * frame.scale
         parts.append(
             f'<rect x="{left:.1f}" y="{frame.y(error):.1f}" width="{width:.1f}" '
-            f'height="{frame.y(0) - frame.y(error):.1f}" fill="{color}"><title>{svg.escape(name)}: {error:.3f} px'
+            f'height="{frame.y(0.0) - frame.y(error):.1f}" fill="{color}"><title>{svg.escape(name)}: {error:.3f} px'
             "</title></rect>"
         )
-    parts.append(svg.line(frame, (0, median), (len(rms), median), svg.INK))
+    parts.append(svg.line(frame, (0.0, median), (float(len(rms)), median), svg.INK))
     return svg.figure(
         frame, f"RMS error of each view, px; median {median:.3f}, worst {rms.max():.3f}",
         [*parts, *svg.ticks(frame, x=False)], across="views",
@@ -157,13 +155,11 @@ def tilts_figure(found: Calibration) -> str:
     """How boards were tilted: the further out the steeper, in the direction in which they lean."""
     angles, directions = board_tilts(found)
     tilts = np.degrees(angles)
-    reach = max(60.0, float(tilts.max()) + 5)
+    reach = max(60.0, float(tilts.max()) + 5.0)
     frame = Frame(-reach, reach, -reach, reach)
-    parts = [svg.ring(frame, 0, 0, radius) for radius in range(15, int(reach), 15)]
+    parts = [svg.ring(frame, 0.0, 0.0, float(radius)) for radius in range(15, int(reach), 15)]
     parts += [
-        svg.dot(
-            frame, tilt * math.cos(angle), tilt * math.sin(angle), 4, svg.ACCENT, title=f"{name}: {tilt:.0f}°"
-        )
+        svg.dot(frame, tilt * math.cos(angle), tilt * math.sin(angle), 4.0, svg.ACCENT, title=f"{name}: {tilt:.0f}°")
         for name, tilt, angle in zip(found.observations.names, tilts, directions, strict=True)
     ]
     title = f"Tilts of the board, degrees from facing the camera: median {np.median(tilts):.0f}°"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Sequence
+from typing import TypeAlias
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -16,6 +17,7 @@ WIDTH = 460.0
 _MARGIN, _TOP, _LEGEND = 46.0, 26.0, 64.0
 _STOPS = ((0x1B, 0x1F, 0x5A), (0x1F, 0x6F, 0x9F), (0x2A, 0xA8, 0x8B), (0xA9, 0xD0, 0x4B), (0xFD, 0xE8, 0x4A))
 """From little to much: dark to light, so that it can be told in grey as well."""
+Place: TypeAlias = Sequence[float] | FloatArray
 INK, PALE, ACCENT, WARNING = "#24292f", "#d0d7de", "#0b62c4", "#c2410c"
 
 
@@ -54,18 +56,15 @@ class Frame:
         return _TOP + self.height * (1 - part if self.up else part)
 
 
-def figure(frame: Frame, title: str, parts: Iterable[str], *, across: str = "", down: str = "", legend: str = "") -> str:
-    """The whole SVG: title above, what is drawn within the frame, words below and at the left, a legend at the right."""
+def figure(
+    frame: Frame, title: str, parts: Iterable[str], *, across: str = "", down: str = "", legend: str = ""
+) -> str:
+    """The whole SVG: title above, what is drawn within the frame, words below, a legend at the right."""
     width, height = _MARGIN + WIDTH + (_LEGEND if legend else 12), _TOP + frame.height + (38 if across else 12)
     left, bottom = _MARGIN, _TOP + frame.height
-    words = [text(_MARGIN, 16, title, size=14)]
+    words = [text(_MARGIN, 16.0, title, size=14)]
     if across:
         words.append(text(left + WIDTH / 2, bottom + 32, across, anchor="middle", color="#57606a"))
-    if down:
-        middle = _TOP + frame.height / 2
-        words.append(
-            f'<g transform="rotate(-90 12 {middle:.1f})">{text(12, middle, down, anchor="middle", color="#57606a")}</g>'
-        )
     return "".join([
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
         'font-family="system-ui, sans-serif" font-size="11" role="img">',
@@ -99,7 +98,9 @@ def ring(frame: Frame, x: float, y: float, radius: float, color: str = PALE) -> 
     return f'<circle cx="{frame.x(x):.1f}" cy="{frame.y(y):.1f}" r="{r:.1f}" fill="none" stroke="{color}"/>'
 
 
-def line(frame: Frame, start: Sequence[float], end: Sequence[float], color: str, width: float = 1.0) -> str:
+def line(
+    frame: Frame, start: Sequence[float] | FloatArray, end: Sequence[float] | FloatArray, color: str, width: float = 1.0
+) -> str:
     """A straight line."""
     return (
         f'<line x1="{frame.x(start[0]):.1f}" y1="{frame.y(start[1]):.1f}" x2="{frame.x(end[0]):.1f}" '
@@ -151,7 +152,7 @@ def color_legend(frame: Frame, low: float, high: float, unit: str) -> str:
     steps, x = 24, _MARGIN + WIDTH + 10
     parts = [
         f'<rect x="{x}" y="{_TOP + frame.height * (1 - (k + 1) / steps):.1f}" width="12" '
-        f'height="{frame.height / steps + 0.4:.1f}" fill="{color_of(k + 0.5, 0, steps)}"/>'
+        f'height="{frame.height / steps + 0.4:.1f}" fill="{color_of(k + 0.5, 0.0, float(steps))}"/>'
         for k in range(steps)
     ]
     for part in (0.0, 0.5, 1.0):

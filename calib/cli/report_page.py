@@ -9,11 +9,11 @@ from html import escape
 import cv2
 import numpy as np
 
-from calib import __version__, report_figures as figures
+from calib import __version__
+from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
 from calib.diagnose import Finding
 from calib.refine import Calibration
-from calib.uncertainty import CalibrationCovariance
 from sfm.core.arrays import ImageU8
 from sfm.core.errors import Rejected
 
@@ -99,14 +99,12 @@ def _quality(result: CalibratedCamera) -> str:
         ("error on the photos it was made from (RMS)", f"{found.rms_px:.4f} px"),
         ("noise of one coordinate of a corner (σ)", f"{found.sigma_px:.4f} px"),
     ]
-    if isinstance(held, Rejected):
-        rows.append(("error on photos that were held out", f"not known: {held.detail or held.reason}"))
-    else:
-        rows.append(("error on photos that were held out", f"{held.rms_px:.4f} px"))
-    if isinstance(halves, Rejected):
-        rows.append(("difference between the cameras of two halves", f"not known: {halves.detail or halves.reason}"))
-    else:
-        rows.append(("difference between the cameras of two halves of the photos", f"{halves.rms_px:.4f} px"))
+    for words, given in (
+        ("error on photos that were held out", held),
+        ("difference between the cameras of two halves of the photos", halves),
+    ):
+        known = f"not known: {given.detail or given.reason}" if isinstance(given, Rejected) else _px(given.rms_px)
+        rows.append((words, known))
     rows.append(("converged", "yes" if found.converged else "no"))
     return _table([], [[label, value] for label, value in rows])
 
@@ -129,11 +127,21 @@ def _parameters(result: CalibratedCamera) -> str:
 
 def _ranked(result: CalibratedCamera) -> Iterator[str]:
     if result.lenses:
-        yield "<h2>Lens models by their error on photos that were held out</h2>"
-        yield _table(["model", "held out", "", "differs by"], [
-            [ranked.lens, "not known" if isinstance(ranked.held_out, Rejected) else f"{ranked.held_out.rms_px:.4f} px",
-             "" , f"{ranked.difference_px:.3f} px"] for ranked in result.lenses
+        yield "<h2>Lens models, by their error on photos that were held out</h2>"
+        yield _table(["", "training", "held out", "differs over the image by"], [
+            [lens.lens, *([_px(lens.rms_px), _px(lens.held_out_rms_px), _px(lens.differs_px)] if not lens.refused
+             else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
+    if result.shapes:
+        yield "<h2>Shapes of the board, likewise</h2>"
+        yield _table(["", "training", "held out", "uncertainty of the camera", ""], [
+            [shape.kind, _px(shape.rms_px), _px(shape.held.rms_px if shape.held else np.nan),
+             _px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
+        ])  # fmt: skip
+
+
+def _px(value: float) -> str:
+    return f"{value:.4f} px" if np.isfinite(value) else ""
 
 
 def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
@@ -154,7 +162,8 @@ def _worst(found: Calibration, photos: Mapping[str, ImageU8]) -> Iterator[str]:
         yield f"<h2>The worst photos</h2><p class='quiet'>Residuals are drawn {_LONGER:.0f} times as long.</p>"
         drawn = [_with_residuals(found, name, photos[name]) for name in names]
         yield _side_by_side([
-            f'<figure><img alt="" src="data:image/jpeg;base64,{picture}"><figcaption>{escape(name)}</figcaption></figure>'
+            f'<figure><img alt="" src="data:image/jpeg;base64,{picture}">'
+            f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, picture in zip(names, drawn, strict=True)
         ])  # fmt: skip
 
@@ -191,11 +200,3 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool = 
 
 def _side_by_side(parts: Sequence[str]) -> str:
     return f'<div class="figures">{"".join(parts)}</div>'
-
-
-def uncertainty_of(result: CalibratedCamera) -> CalibrationCovariance | None:
-    """The covariance that counts: by views where there are enough of them."""
-    for given in (result.by_view, result.covariances):
-        if not isinstance(given, Rejected):
-            return given
-    return None
