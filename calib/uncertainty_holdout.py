@@ -26,12 +26,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.refine import Calibration, CalibrationConfig, calibrate
+from calib.refine_board import BoardShape
 from calib.refine_lenses import lens_by_name
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_views import BoardView, Observations
 from calib.uncertainty import pixel_grid, projection_difference
 from calib.zhang import poses_of_views
 from sfm.core.arrays import Points3D, Value, Vector
+from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
@@ -96,18 +98,26 @@ def hold_out(
 
 def pose_only_errors(found: Calibration, observations: Observations) -> Vector:
     """(V,) mean squared length of residuals in px² with this camera and board, each view's pose fitted to it."""
-    R, t, errors = poses_of_views(observations, found.camera)
+    system, seen = fit_poses(found.camera, found.shape, observations)
     out = np.full(len(observations), np.inf)
-    seen = np.flatnonzero(np.isfinite(errors) & np.isfinite(t).all(1)).tolist()
     if not seen:
         return out
-    some = observations.of_views(seen)
-    system = CalibrationSystem(some, Estimate(found.camera, R[seen], t[seen], found.shape), np.zeros(0, np.int64))
-    minimize(system, _POSES)
+    some = system.observations
     lengths = np.sum(system.residuals() ** 2, axis=1)
     sums = np.bincount(some.view_of, np.where(np.isfinite(lengths), lengths, np.inf), len(some))
     out[seen] = sums / np.diff(some.offsets)
     return out
+
+
+def fit_poses(camera: Camera, shape: BoardShape, observations: Observations) -> tuple[CalibrationSystem, list[int]]:
+    """The problem of the poses alone, at its solution, and the views in it: those with a pose before this camera."""
+    R, t, errors = poses_of_views(observations, camera)
+    seen = np.flatnonzero(np.isfinite(errors) & np.isfinite(t).all(1)).tolist()
+    estimate = Estimate(camera, R[seen], t[seen], shape)
+    system = CalibrationSystem(observations.of_views(seen), estimate, np.zeros(0, np.int64))
+    if seen:
+        minimize(system, _POSES)
+    return system, seen
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

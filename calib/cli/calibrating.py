@@ -29,9 +29,11 @@ from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, Observer, StageFinished, StageStarted
+from sfm.io.images import list_images
 
 STAGE = "calibration"
 AUTO = "auto"
+_IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".jp2")
 Auto: TypeAlias = Literal["auto"]
 _WHILE_LENS_IS_CHOSEN: ShapeKind = "paraboloid"
 """Of all shapes it costs least where it is not needed, and takes most of a bend."""
@@ -139,7 +141,16 @@ def see_board(
     photos = find_photos(sources)
     cache = detection_cache() if use_cache else None
     seen = detect_photos(photos, board, threads=threads, cache=cache, observer=observer)
-    return Sightings(board, board.points3D, *sorted_out(seen, weighted=weighted), digest=digest_of(photos))
+    views, left_out = sorted_out(seen, weighted=weighted)
+    return Sightings(board, board.points3D, views, (*_not_images(sources), *left_out), digest_of(photos))
+
+
+def _not_images(sources: Sequence[Path]) -> list[RejectedView]:
+    """Files in folders that are images by their suffix only."""
+    skipped = [pair for source in sources if source.is_dir() for pair in list_images(source).skipped]
+    return [
+        RejectedView(name, "unreadable", why) for name, why in skipped if Path(name).suffix.lower() in _IMAGE_SUFFIXES
+    ]
 
 
 def sorted_out(
