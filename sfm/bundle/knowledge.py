@@ -172,9 +172,7 @@ class _ExpectedParams:
 
     @staticmethod
     def of(problem: BundleProblem, layout: Layout) -> _ExpectedParams:
-        shared = layout.shared
-        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
-        camera, column = shared.camera[row], shared.columns[row, place]
+        camera, column, row, place = layout.parameters
         expected = weights = np.zeros(0)
         if problem.prior_params is not None and problem.prior_sigmas is not None:
             expected, weights = problem.prior_params[camera, column], problem.prior_sigmas[camera, column] ** -2.0
@@ -183,8 +181,7 @@ class _ExpectedParams:
         rows, number = np.unique(row, return_inverse=True)
         blocks = np.zeros((len(rows), BLOCK, BLOCK))
         blocks[number, place, place] = weights
-        poses, cells = len(layout.slot_frame), (camera[known], column[known])
-        return _ExpectedParams(cells, (poses + row, place), expected[known], weights, poses + rows, blocks)
+        return _ExpectedParams((camera[known], column[known]), (row, place), expected[known], weights, rows, blocks)
 
     def linearize(self, params: FloatArray, gradient: FloatArray) -> float:
         """The cost, and its gradient into that of all rows (rows, 6)."""

@@ -121,6 +121,13 @@ class Layout:
         """Whether no shared row has more than three unknowns."""
         return not np.any(self.shared.columns[:, 3:] >= 0)
 
+    @property
+    def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(K,) camera and column of each free camera parameter, its row of six and its place there."""
+        shared = self.shared
+        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        return shared.camera[row], shared.columns[row, place], len(self.slot_frame) + row, place
+
     def pattern(self, rows: np.ndarray, columns: np.ndarray) -> BlockPattern:
         """The blocks of S that points and images fill, and those in `rows` and `columns`, of the lower triangle."""
         marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)

@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from sfm.bundle.adjustment import squared_errors
-from sfm.bundle.problem import BundleProblem, RigArrays
+from sfm.bundle.problem import BundleProblem
+from sfm.bundle.rig_arrays import RigArrays
 from sfm.core.arrays import BoolArray
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.camera import Camera

@@ -14,7 +14,8 @@ import pytest
 
 from sfm.bundle import _kernels as kernels
 from sfm.bundle.layout import SENSOR_COLUMN, Layout, lay_out
-from sfm.bundle.problem import BundleProblem, RigArrays
+from sfm.bundle.problem import BundleProblem
+from sfm.bundle.rig_arrays import RigArrays
 from sfm.core.cameras._kernels import project_with_jacobians
 from sfm.core.cameras._lane_kernels import LANES
 from sfm.core.geometry.rigid import Rigid3
