@@ -21,7 +21,7 @@ from calib.refine_board import BoardShape, ShapeKind
 from calib.refine_fit import CalibrationConfig
 from calib.refine_reject import RejectedView
 from calib.rig_alone import AloneCamera, camera_alone, shape_of
-from calib.rig_poses import BoardTurn, FirstPoses, first_poses, turn_of
+from calib.rig_poses import BoardTurn, CameraFrames, FirstPoses, first_poses, turn_of
 from calib.rig_reject import RigFit, reject_from_rig
 from calib.rig_system import RigEstimate, RigSystem
 from calib.rig_views import RigCamera, RigObservations
@@ -233,15 +233,21 @@ def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
 def _first(
     board: Points3D, alone: Sequence[AloneCamera], frames: tuple[str, ...], turns: Sequence[BoardTurn], min_frames: int
 ) -> FirstPoses | Rejected:
-    at = {frame: f for f, frame in enumerate(frames)}
-    poses, corners = [], []
+    seen = []
     for one in alone:
-        counts = np.diff(one.observations.offsets).tolist()
-        poses.append({at[frame]: one.cams_from_board[v] for v, frame in enumerate(one.frames)})
-        corners.append({at[frame]: counts[v] for v, frame in enumerate(one.frames)})
+        at = _positions(frames, one.frames)
+        order = np.argsort(at)
+        corners = np.bincount(at, np.diff(one.observations.offsets), len(frames)).astype(np.int64)
+        seen.append(CameraFrames(at[order], one.cams_from_board[order], corners))
     low, high = board.min(0), board.max(0)
     probes = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    return first_poses(tuple(one.name for one in alone), poses, corners, turns, probes, min_frames)
+    return first_poses(tuple(one.name for one in alone), seen, turns, probes, min_frames)
+
+
+def _positions(frames: tuple[str, ...], some: tuple[str, ...]) -> np.ndarray:
+    """Of some frames among all."""
+    at = {frame: f for f, frame in enumerate(frames)}
+    return np.array([at[frame] for frame in some], np.int64)
 
 
 def _gathered(
@@ -249,19 +255,16 @@ def _gathered(
     turns: Sequence[BoardTurn], config: RigConfig,
 ) -> tuple[RigObservations, RigEstimate]:  # fmt: skip
     """All views, read from the same side and weighted, with where everything is at first."""
-    at = {frame: f for f, frame in enumerate(frames)}
     typical = float(np.median([one.sigma_px for one in alone]))
     cameras, frame_of = [], []
     for c, one in enumerate(alone):
         o = one.observations
-        rows = o.rows.copy()
-        for v, frame in enumerate(one.frames):
-            part = slice(o.offsets[v], o.offsets[v + 1])
-            rows[part] = turns[first.turns[c][at[frame]]].rows[rows[part]]
+        at = _positions(frames, one.frames)
+        rows = np.stack([turn.rows for turn in turns])[first.turns[c][at][o.view_of], o.rows]
         weight = typical / one.sigma_px if config.weigh_cameras else 1.0
         cameras.append(dataclasses.replace(o, rows=rows, roots=weight * o.roots, board=board))
-        frame_of.append(np.array([at[frame] for frame in one.frames], np.int64))
-    poses = Rigid3.stack([first.rigs_from_board[f] for f in range(len(frames))])
+        frame_of.append(at)
+    poses = first.rigs_from_board
     estimate = RigEstimate(
         tuple(one.camera for one in alone), first.cams_from_rig.rotation.matrix,
         np.array(first.cams_from_rig.translation), poses.rotation.matrix, np.array(poses.translation),
@@ -316,7 +319,7 @@ def _result(
         observations=observations,
         residuals=tuple(residuals),
         alone=tuple(alone),
-        turned=tuple(tuple(frames[f] for f, turn in sorted(chosen.items()) if turn) for chosen in first.turns),
+        turned=tuple(tuple(frames[f] for f in np.flatnonzero(chosen)) for chosen in first.turns),
         rejected_views=tuple(tuple(one) for one in views),
         rejected_corners=tuple(tuple(one) for one in corners),
         rms_px=math.sqrt(total / observations.corner_count),
