@@ -103,6 +103,11 @@ def diagnose(found: Calibration) -> tuple[Finding, ...]:
     )
 
 
+def diagnose_photos(found: Calibration) -> tuple[Finding, ...]:
+    """What is wrong with the photos and the board, whatever the camera."""
+    return tuple(finding for part in (_views, _poses, _shape_of_residuals) for finding in part(found))
+
+
 def _solution(found: Calibration) -> Iterator[Finding]:
     if not found.converged:
         yield Finding(

@@ -81,6 +81,26 @@ LENSES: tuple[Lens, ...] = (
 _BY_NAME = {lens.name: lens for lens in LENSES}
 
 
+def lens_called(name: str) -> Lens:
+    """The row of the table called `name`, or the one that estimates all parameters of COLMAP's model of that name.
+
+    Capitals, - and _ make no difference. So `opencv` is COLMAP's OPENCV with k1, k2, p1, p2, in the whole of Parallax;
+    the five coefficients that OpenCV estimates by default are opencv5.
+
+    Raises:
+        ValueError: there is none.
+    """
+    word = name.strip().lower().replace("-", "_")
+    if word in _BY_NAME:
+        return _BY_NAME[word]
+    for lens in LENSES:
+        model = model_by_name(lens.model)
+        if word == model.name.lower() and lens.free_names == model.param_names:
+            return lens
+    models = dict.fromkeys(lens.model for lens in LENSES)
+    raise ValueError(f"unknown lens model {name!r}; known are {', '.join(_BY_NAME)}, and COLMAP's {', '.join(models)}")
+
+
 def lens_by_name(name: str) -> Lens:
     """The row of the table called `name`.
 

@@ -14,13 +14,16 @@ from sfm.core.errors import ExitCode, SfmError
 COMMANDS = {
     "board": "a board to print: PDF or SVG at true scale",
     "detect": "the corners of a board in photos, and what they look like",
+    "camera": "photos of a board → a camera, and how far to trust it",
+    "check": "whether other photos agree with a camera, and which would help most",
 }
 """In the order in which they are used; `calib.cli.<name>` holds each."""
 
 _EXAMPLES = """\
 Examples:
   calib board chessboard --cols 9 --rows 6 --square 25mm -o board.pdf
-  calib detect photos --board board.toml --overlays seen
+  calib camera photos --board board.toml -o camera.toml
+  calib check camera.toml more_photos
   calib board --help               # the options of a command, with examples"""
 
 
@@ -72,6 +75,8 @@ def _guarded(name: str, words: list[str]) -> int:
         return ExitCode.OK
     except SystemExit as error:  # tyro has printed help, or what is wrong with the options
         return error.code if isinstance(error.code, int) else ExitCode.USAGE
+    except Exception as error:
+        return _bug(error)
 
 
 def _settle_threads_and_kernels() -> None:
@@ -81,3 +86,20 @@ def _settle_threads_and_kernels() -> None:
     from sfm.io.kernel_cache import use_kernel_cache
 
     use_kernel_cache()
+
+
+def _bug(error: Exception) -> int:
+    """One line for the user, and where the rest is."""
+    cause = " ".join(str(error).split())[:200]
+    print(f"error: this is a bug in Parallax: {type(error).__name__}: {cause}", file=sys.stderr)
+    print(f"log: {_crash_log(error)}", file=sys.stderr)
+    return ExitCode.BUG
+
+
+def _crash_log(error: Exception) -> str:
+    import tempfile
+    import traceback
+
+    with tempfile.NamedTemporaryFile("w", prefix="calib-crash-", suffix=".log", delete=False, encoding="utf-8") as file:
+        traceback.print_exception(error, file=file)
+        return file.name

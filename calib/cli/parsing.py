@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias, TypeVar
@@ -57,3 +58,15 @@ def board_of(text: str) -> Board:
         raise ConfigError(error.cause, path=path, remedy=error.remedy) from error
     except UnicodeDecodeError as error:
         raise ConfigError("is no text in UTF-8", path=path) from error
+
+
+def pixel_size(text: str) -> tuple[int, int]:
+    """Width and height of `752x480`.
+
+    Raises:
+        ConfigError: it is no size.
+    """
+    found = re.fullmatch(r"\s*(\d+)\s*[x×,]\s*(\d+)\s*", text.lower())
+    if not found or min(int(found[1]), int(found[2])) < 1:
+        raise ConfigError(f"{text!r} is no size", remedy="give width and height in px, as in 752x480")
+    return int(found[1]), int(found[2])

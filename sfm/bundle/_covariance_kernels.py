@@ -5,8 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import WIDTH
-from sfm.core.optim._schur_kernels import fill_coupling
+from sfm.core.optim._block_kernels import WIDTH, set_coupling
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -40,7 +39,7 @@ def point_covariances(
     for p in range(first, last):
         widest = max(widest, starts[p + 1] - starts[p] + shared_starts[p + 1] - shared_starts[p])
     rows, U = np.empty(widest, np.int64), np.empty((widest, 3, 6))
-    m, w, t = np.empty((3, 3)), np.empty((3, WIDTH)), np.empty((3, 6))
+    m, w, t = np.empty((3, 3)), np.empty((1, 3, WIDTH)), np.empty((3, 6))
     for p in range(first, last):
         if not free[p]:
             continue
@@ -57,15 +56,15 @@ def point_covariances(
             if k < own:
                 e = starts[p] + k
                 s = slot[e]
-                fill_coupling(N[e], X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2], w)
+                set_coupling(w, 0, N, e, (X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2]))
                 rows[k] = s
             else:
                 e = shared_starts[p] + k - own
                 rows[k] = shared_slot[e]
-                w[:, :6] = B[e]
+                w[0, :, :6] = B[e]
             for i in range(3):
                 for a in range(6):
-                    U[k, i, a] = m[i, 0] * w[0, a] + m[i, 1] * w[1, a] + m[i, 2] * w[2, a]
+                    U[k, i, a] = m[i, 0] * w[0, 0, a] + m[i, 1] * w[0, 1, a] + m[i, 2] * w[0, 2, a]
         for i in range(3):
             for j in range(3):
                 out[p, i, j] = m[i, j]

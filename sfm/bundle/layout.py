@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 
@@ -25,8 +26,8 @@ from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.execution import chunk_bounds
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
-_OBSERVATIONS_PER_CHUNK = 8192
-_MAX_CHUNKS = 16
+_OBSERVATIONS_PER_CHUNK, _MAX_CHUNKS = 8192, 16
+"""At most, and chunks are a power of two: three would keep one of two threads waiting."""
 _OWN_WORK, _NARROW_WORK = 4.0, 0.6
 """What a coupling takes beside its products with others, and what a product of three rows takes instead of six."""
 SENSOR_COLUMN = MAX_PARAMS
@@ -183,7 +184,7 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         point, image_shared.take(image, axis=0), problem.free_points, len(slot_frame) + len(shared)
     )
     couples = (slots >= 0) & _changes(point, slots)
-    chunks = int(np.clip(len(point) // _OBSERVATIONS_PER_CHUNK, 1, _MAX_CHUNKS))
+    chunks = min(1 << max(math.ceil(len(point) / _OBSERVATIONS_PER_CHUNK) - 1, 0).bit_length(), _MAX_CHUNKS)
     return Layout(
         original=by_point,
         image_offsets=image_offsets,

@@ -150,7 +150,7 @@ class ReducedSystem:
     ) -> None:
         self.plan, self._layout, self._held, self._couplings, self._workers = plan, layout, held, couplings, workers
         self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
-        self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
+        self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, WIDTH))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
         self._narrow = layout.is_narrow
@@ -177,7 +177,7 @@ class ReducedSystem:
         self._blocks.fill(0)
         self._own.add(self._blocks)
         self._side[:, :BLOCK] = -self._own_gradient
-        self._diagonal[:] = self._own.diagonal
+        self._diagonal[:, :BLOCK] = self._own.diagonal
 
         self._gradient_of_points = g
         self._workers.map(self._eliminate_rows, self._ranges)
@@ -253,12 +253,13 @@ class ReducedSystem:
 
     def _marquardt_diagonal(self) -> FloatArray:
         """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
-        raised, poses = np.empty_like(self._diagonal), len(self._layout.slot_frame)
+        diagonal, poses = self._diagonal[:, :BLOCK], len(self._layout.slot_frame)
+        raised = np.empty_like(diagonal)
         cameras = poses + int(np.sum(self._layout.shared.camera >= 0))
         sensors = cameras + int(np.sum(self._layout.shared.sensor >= 0))
         for part in (slice(None, poses), slice(poses, cameras), slice(cameras, sensors), slice(sensors, None)):
-            largest = self._diagonal[part].max(axis=0, initial=0.0)
-            np.maximum(self._diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
+            largest = diagonal[part].max(axis=0, initial=0.0)
+            np.maximum(diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
         return raised
 
 

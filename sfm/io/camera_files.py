@@ -7,6 +7,8 @@ width = 4000
 height = 3000
 pixel_center = 0.5                # where the centre of the first pixel is: 0.5 (default), or 0.0 as in OpenCV
 params = [3200.0, 3200.0, 2000.0, 1500.0, 0.01, 0.0, 0.0, 0.0]      # fx, fy, cx, cy, k1, k2, p1, p2
+
+and further tables where it was calibrated: see `camera_records`.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from sfm.core.cameras import MODELS, Camera, model_by_name
 from sfm.core.errors import ConfigError, FormatError
 from sfm.io import colmap_binary, colmap_text
 from sfm.io.atomic import os_errors, write_text
+from sfm.io.camera_records import TABLES, CameraRecord, record_from_document, record_lines
 
 _REQUIRED = ("model", "width", "height", "params")
 _KEYS = ("name", *_REQUIRED, "pixel_center")
@@ -41,7 +44,7 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
     path = Path(path)
     match path.suffix.lower():
         case ".toml":
-            cameras = {1: _read_toml(path)}
+            cameras = {1: read_camera_file(path)[0]}
         case ".bin":
             cameras = colmap_binary.read_cameras(path)
         case ".txt":
@@ -61,8 +64,10 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
     }
 
 
-def write_camera_toml(path: Path | str, camera: Camera, *, name: str = "") -> None:
-    """Writes one camera; every number reads back as it is.
+def write_camera_toml(
+    path: Path | str, camera: Camera, *, name: str = "", record: CameraRecord = CameraRecord()
+) -> None:
+    """Writes one camera and what is known about it; every number reads back as it is.
 
     Raises:
         InputError: the system refuses.
@@ -75,22 +80,44 @@ def write_camera_toml(path: Path | str, camera: Camera, *, name: str = "") -> No
         f"height = {camera.height}",
         "pixel_center = 0.5",
         f"params = {camera.params.tolist()}  # {', '.join(camera.model_info.param_names)}",
+        *record_lines(record),
     ]
     write_text(Path(path), "\n".join(lines) + "\n")
 
 
-def _read_toml(path: Path) -> Camera:
+def read_camera_file(path: Path | str) -> tuple[Camera, CameraRecord]:
+    """The camera of a camera file, and what is known about it.
+
+    Raises:
+        InputError: the file cannot be opened.
+        FormatError: it is no TOML.
+        ConfigError: a table or key is unknown, missing or out of its range.
+    """
+    path = Path(path)
     with os_errors(path):
         text = path.read_bytes()
     try:
         document = tomllib.loads(text.decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FormatError(f"is no TOML: {error}", path=path) from error
-    _check_keys(document, ("camera",), path)
+    _check_keys(document, ("camera", *TABLES), path)
     table = document.get("camera")
     if not isinstance(table, dict):
         raise ConfigError("has no table [camera]", path=path)
-    _check_keys(table, _KEYS, path)
+    camera = camera_from_table(table, path)
+    return camera, record_from_document(document, camera.model_info, path)
+
+
+def camera_from_table(table: dict[str, Any], path: Path, *, further: tuple[str, ...] = ()) -> Camera:
+    """The camera of a table [camera] of a TOML file.
+
+    Args:
+        path: of the file, for errors.
+        further: keys that are allowed beside those of a camera.
+    Raises:
+        ConfigError: a key is unknown, missing or out of its range.
+    """
+    _check_keys(table, (*_KEYS, *further), path)
     missing = [key for key in _REQUIRED if key not in table]
     if missing:
         raise ConfigError(f"[camera] lacks {', '.join(missing)}", path=path)

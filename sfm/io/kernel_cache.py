@@ -61,15 +61,15 @@ def user_cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "parallax"
 
 
-def is_complete(folder: Path) -> bool:
-    """Whether all kernels of a run are compiled into `folder`."""
-    return (folder / f"{_COMPLETE}-{kernel_hash()}").exists()
+def is_complete(folder: Path, part: str = _COMPLETE) -> bool:
+    """Whether all kernels of a reconstruction, or of another part, are compiled into `folder`."""
+    return (folder / f"{part}-{kernel_hash()}").exists()
 
 
-def mark_complete(folder: Path) -> None:
-    """Notes that all kernels of a run are in `folder`."""
+def mark_complete(folder: Path, part: str = _COMPLETE) -> None:
+    """Notes that all these kernels are in `folder`."""
     if _is_writable(folder):
-        (folder / f"{_COMPLETE}-{kernel_hash()}").touch()
+        (folder / f"{part}-{kernel_hash()}").touch()
 
 
 def _is_writable(folder: Path) -> bool:

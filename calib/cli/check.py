@@ -1,0 +1,177 @@
+"""`calib check`: whether photos agree with a camera."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from calib.cli.parsing import Flag, board_of, parsed, pixel_size
+from sfm.core.errors import ConfigError, ExitCode, InputError, Rejected
+
+if TYPE_CHECKING:
+    from calib.boards import Board
+    from calib.cli.calibrating import Sightings
+    from calib.refine_board import BoardShape
+    from sfm.core.cameras import Camera
+    from sfm.io.camera_records import CameraRecord
+
+EXAMPLES = (
+    "calib check camera.toml photos",
+    "calib check camera.toml photos --board board.toml --suggest next.svg",
+    "calib check camera.toml photos --max-error 0.3 --json",
+)
+_TOLERANCE = 2.0
+"""Times the held-out error of the calibration that other photos may have: light and blur differ."""
+_UNKNOWN_PX = 1.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CheckOptions:
+    """Whether photos of a board agree with a camera, and if not, what has changed; and which photos would help most.
+
+    Only the poses of the board are fitted. The exit code is 5 where the error is above the limit, or where focal length
+    or principal point have changed.
+    """
+
+    camera: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")]
+    """Camera file."""
+
+    images: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="IMAGES", help_behavior_hint="")]
+    """Folders of photos, or photos, best such as it was not calibrated with; or corners, as in `calib camera`."""
+
+    board: Annotated[str, tyro.conf.arg(metavar="BOARD", help_behavior_hint="(default: that of the camera file)")] = ""
+    """What is in the photos; with the shape that the camera file has for it, if it is the same."""
+
+    max_error: Annotated[
+        float | None, tyro.conf.arg(metavar="PX", help_behavior_hint="(default: twice the held-out error of the file)")
+    ] = None
+    """Rms error that is allowed."""
+
+    size: Annotated[str, tyro.conf.arg(metavar="WxH", help_behavior_hint="")] = ""
+    """Width and height of the photos in px, for files of corners that do not say it."""
+
+    suggest: Annotated[Path | None, tyro.conf.arg(metavar="FILE.svg", help_behavior_hint="")] = None
+    """Draws where to hold the board in the next three photos."""
+
+    json: Flag = False
+    """Everything as JSON."""
+
+    no_cache: Flag = False
+    """Looks for the board anew, and keeps nothing."""
+
+    threads: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 0)")] = 0
+    """At most so many photos at once; 0 for all cores."""
+
+
+def main(words: Sequence[str]) -> int:
+    """Runs the command."""
+    options = parsed(CheckOptions, "check", words, EXAMPLES)
+    _check_options(options)
+
+    from calib.check import check_camera
+    from calib.cli.calibrating import see_board
+    from calib.cli.check_report import check_json, check_lines
+    from calib.cli.next_photos import further_photos
+    from calib.cli.progress import kernels_announced, told
+    from calib.cli.refusals import no_check
+    from calib.cli.suggestions_svg import suggestions_svg
+    from sfm.io.atomic import write_text
+
+    original, record = _read(options.camera)
+    board = board_of(options.board) if options.board else _board_of_file(options.camera, record)
+    observer, size = told(), pixel_size(options.size) if options.size else None
+    with kernels_announced(observer):
+        seen = see_board(
+            options.images, board, size=size, threads=options.threads, use_cache=not options.no_cache,
+            observer=observer,
+        )  # fmt: skip
+        camera, sigmas = _at_size(original, record, seen)
+        limit = options.max_error or _limit(record)
+        checked = check_camera(camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas)
+    if isinstance(checked, Rejected):
+        raise no_check(seen, checked, options.images)
+    factor = camera.width / original.width
+    suggested = further_photos(camera, record, seen, checked.found, resized_by=factor)
+    if options.suggest:
+        points = checked.found.observations.points2D
+        write_text(options.suggest, suggestions_svg(camera, seen.board, points, None, suggested))
+    if options.json:
+        print(json.dumps(check_json(checked, seen, record, suggested), indent=2, ensure_ascii=False))
+    else:
+        print("\n".join(check_lines(checked, seen, record, suggested)))
+    return ExitCode.QUALITY_GATE_FAILED if checked.failed else ExitCode.OK
+
+
+def _check_options(options: CheckOptions) -> None:
+    if options.threads < 0:
+        raise ConfigError(f"--threads must not be negative, got {options.threads}")
+    if not options.images:
+        raise ConfigError("no photos are named", remedy="name a folder of photos after the camera file")
+    if options.max_error is not None and not options.max_error > 0:
+        raise ConfigError(f"--max-error must be positive, got {options.max_error:g}")
+    if options.suggest and options.suggest.suffix.lower() != ".svg":
+        raise ConfigError(f"--suggest must end in .svg, got {options.suggest}")
+
+
+def _read(path: Path) -> tuple[Camera, CameraRecord]:
+    from sfm.io.camera_files import read_camera_file, read_intrinsics
+    from sfm.io.camera_records import CameraRecord
+
+    if path.suffix.lower() == ".toml":
+        return read_camera_file(path)
+    cameras = read_intrinsics(path)
+    if len(cameras) > 1:
+        raise InputError(f"holds {len(cameras)} cameras", path=path, remedy="give a file with one camera")
+    return next(iter(cameras.values())), CameraRecord()
+
+
+def _board_of_file(path: Path, record: CameraRecord) -> Board | None:
+    from calib.boards_text import parse_board
+
+    if record.board is None:
+        return None
+    try:
+        return parse_board(record.board.spec)
+    except ConfigError as error:
+        raise ConfigError(f"[board] {error.cause}", path=path, remedy="name the board with --board") from error
+
+
+def _at_size(camera: Camera, record: CameraRecord, seen: Sightings) -> tuple[Camera, dict[str, float]]:
+    """The camera at the size of the photos, if these were resized as a whole, and its standard deviations."""
+    from calib.check import resized
+
+    known = record.uncertainty
+    sigmas: dict[str, float] = {}
+    if known is not None:
+        best = [a if a == a else b for a, b in zip(known.sigma_by_view.tolist(), known.sigma.tolist(), strict=True)]
+        sigmas = dict(zip(known.free, best, strict=True))
+    sizes = {(view.width, view.height) for view in seen.views}
+    if len(sizes) != 1:
+        return camera, sigmas
+    width, height = sizes.pop()
+    if (width, height) == (camera.width, camera.height):
+        return camera, sigmas
+    if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
+        return camera, sigmas
+    return resized(camera, sigmas, width, height)
+
+
+def _limit(record: CameraRecord) -> float:
+    held_out = record.number("holdout_rms_px")
+    known = held_out if held_out == held_out else record.number("rms_px")
+    return _TOLERANCE * known if known == known else _UNKNOWN_PX
+
+
+def _shape(record: CameraRecord, seen: Sightings) -> BoardShape:
+    """Where the corners lie: as estimated when the camera was calibrated, if it is the same board."""
+    from calib.check import known_shape
+
+    board, spec = record.board, seen.board.spec if seen.board is not None else None
+    if board is not None and board.spec == spec and board.displacements.shape == seen.points3D.shape:
+        return known_shape(seen.points3D + board.displacements)
+    return known_shape(seen.points3D)

@@ -1,0 +1,92 @@
+"""Which shape of the board predicts frames best that a rig has not seen.
+
+As `uncertainty_shapes` for one camera: the simplest shape whose error on held-out frames is within a standard error of
+the best one. A board that is taken for flat and is not bends cameras and baseline alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.refine_board import ShapeKind
+from calib.rig import RigCalibration, RigConfig, calibrate_rig
+from calib.rig_poses import BoardTurn
+from calib.rig_uncertainty import RigHeldOut, hold_out_frames
+from calib.rig_views import RigCamera
+from sfm.core.arrays import Points3D, Value
+from sfm.core.errors import Rejected
+
+CANDIDATES: tuple[ShapeKind, ...] = ("flat", "paraboloid", "free")
+"""From the simplest to the richest."""
+_LARGEST_WORK = 1e10
+"""Corners times squared number of coefficients, beyond which a shape takes minutes."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RankedRig(Value):
+    """A rig with one shape of the board among others; `refused` says why there is none, or why it is not judged."""
+
+    kind: ShapeKind
+    found: RigCalibration | None = None
+    held: RigHeldOut | None = None
+    refused: str = ""
+
+    @property
+    def held_out_rms_px(self) -> float:
+        """NaN where it is not known."""
+        return math.nan if self.held is None else self.held.rms_px
+
+
+def choose_rig_shape(
+    board: Points3D, cameras: Sequence[RigCamera], config: RigConfig = RigConfig(), *,
+    turns: Sequence[BoardTurn] = (), shapes: Sequence[ShapeKind] = CANDIDATES, folds: int = 5, seed: int = 0,
+) -> tuple[RankedRig, ...] | Rejected:  # fmt: skip
+    """Rigs by shape, the chosen one first.
+
+    Returns:
+        what the first shape was refused for, where all are.
+    """
+    rows, first = [], Rejected("no_shape", "none was asked for")
+    corners = sum(len(view.corner_ids) for one in cameras for view in one.views)
+    for kind in shapes:
+        count = {"flat": 0, "scale": 1, "paraboloid": 3, "height": len(board), "free": 3 * len(board)}[kind]
+        if corners * float(count) ** 2 > _LARGEST_WORK:
+            rows.append(RankedRig(kind, refused="takes minutes; it is done if it is asked for by name"))
+            continue
+        found = calibrate_rig(board, cameras, dataclasses.replace(config, shape=kind), turns=turns)
+        if isinstance(found, Rejected):
+            first = first if rows else found
+            rows.append(RankedRig(kind, refused=f"{found.reason}: {found.detail}"))
+            continue
+        held = hold_out_frames(found, folds=folds, rng=np.random.default_rng(seed))
+        if isinstance(held, Rejected):
+            rows.append(RankedRig(kind, found, refused=f"{held.reason}: {held.detail}"))
+        else:
+            rows.append(RankedRig(kind, found, held))
+    if not any(row.found for row in rows):
+        return first
+    chosen = _chosen(rows)
+    return (chosen, *(row for row in rows if row is not chosen))
+
+
+def _chosen(rows: Sequence[RankedRig]) -> RankedRig:
+    judged = [row for row in rows if row.found is not None and row.held is not None and row.found.converged]
+    if not judged:
+        return next(row for row in rows if row.found is not None)
+    best = min(judged, key=lambda row: row.held_out_rms_px)
+    return next(row for row in judged if _as_good(row.held, best.held))
+
+
+def _as_good(held: RigHeldOut | None, best: RigHeldOut | None) -> bool:
+    """Whether its frames, of those that both have, are worse by less than the standard error of the difference."""
+    assert held is not None
+    assert best is not None
+    _, at1, at2 = np.intersect1d(held.frames, best.frames, return_indices=True)
+    excess = held.squares[at1] - best.squares[at2]
+    if len(excess) < 2:
+        return True
+    return bool(excess.mean() <= excess.std(ddof=1) / math.sqrt(len(excess)))
