@@ -162,7 +162,7 @@ def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
         unmoved = np.zeros((np.sum(~problem.rigs.free_sensors), 3, 7))
         unmoved[:, :, 6] = lengths[~problem.rigs.free_sensors]
         forbidden.append(unmoved.reshape(-1, 7))
-    forbidden += [motions_seen(problem, layout, tangents)]
+    forbidden += [motions_seen(problem, layout, tangents, shared)]
     _, sizes, directions = np.linalg.svd(np.concatenate(forbidden))
     allowed = directions[sizes <= 1e-9 * max(float(sizes.max()), 1e-300)].T
     free = np.concatenate([tangents[layout.slot_frame], shared])
@@ -183,21 +183,20 @@ def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: Marginals) -> tu
     J = np.zeros((count, 6, 6))
     J[:, :3, :3] = J[:, 3:, 3:] = R
     J[:, 3:, :3] = -R @ skew(arms)
-    frames, sensors = layout.image_slot.astype(np.int64), _sensor_rows(layout)
-    crossed = J @ sigma.between(frames, sensors)
-    blocks = J @ sigma.between(frames, frames) @ J.transpose(0, 2, 1)
-    blocks += crossed + crossed.transpose(0, 2, 1) + sigma.between(sensors, sensors)
-    centers = R.transpose(0, 2, 1) @ blocks[:, 3:, 3:] @ R
+    # The centre straight from the frame's, so that what is held stays exactly zero.
+    K, back = np.zeros((count, 3, 6)), np.zeros((count, 3, 6))
+    K[:, :, :3], K[:, :, 3:], back[:, :, 3:] = -skew(arms), np.eye(3), R.transpose(0, 2, 1)
+    frames, sensors = layout.image_slot.astype(np.int64), layout.image_sensor_row
+    both = sigma.between(frames, frames), sigma.between(frames, sensors), sigma.between(sensors, sensors)
+    blocks, centers = _of_sum(J, np.broadcast_to(np.eye(6), J.shape), *both), _of_sum(K, back, *both)
     blocks[unseen & problem.free_poses], centers[unseen & problem.free_poses] = np.nan, np.nan
     return blocks, centers
 
 
-def _sensor_rows(layout: Layout) -> np.ndarray:
-    """(I,) the row of each image's sensor, −1 where it has none that moves."""
-    first = len(layout.slot_frame)
-    mounts = first + np.flatnonzero(layout.shared.sensor >= 0)
-    rows = np.where(np.isin(layout.image_shared, mounts), layout.image_shared, -1)
-    return rows.max(axis=1, initial=-1).astype(np.int64)
+def _of_sum(A: FloatArray, B: FloatArray, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
+    """Covariances of A x + B y from those of x and y."""
+    crossed = A @ xy @ B.transpose(0, 2, 1)
+    return A @ xx @ A.transpose(0, 2, 1) + crossed + crossed.transpose(0, 2, 1) + B @ yy @ B.transpose(0, 2, 1)
 
 
 def _camera_blocks(layout: Layout, sigma: Marginals, cameras: int) -> FloatArray:

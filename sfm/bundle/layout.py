@@ -128,6 +128,13 @@ class Layout:
         row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
         return shared.camera[row], shared.columns[row, place], len(self.slot_frame) + row, place
 
+    @property
+    def image_sensor_row(self) -> np.ndarray:
+        """(I,) the row of each image's sensor, −1 where it has none that moves."""
+        mounts = len(self.slot_frame) + np.flatnonzero(self.shared.sensor >= 0)
+        rows = np.where(np.isin(self.image_shared, mounts), self.image_shared, -1)
+        return rows.max(axis=1, initial=-1).astype(np.int64)
+
     def pattern(self, rows: np.ndarray, columns: np.ndarray) -> BlockPattern:
         """The blocks of S that points and images fill, and those in `rows` and `columns`, of the lower triangle."""
         marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)

@@ -185,7 +185,7 @@ class ReducedSystem:
     @property
     def diagonal(self) -> FloatArray:
         """(rows, 6) of the normal matrix, as last eliminated."""
-        return self._diagonal
+        return self._diagonal[:, :BLOCK]
 
     def solve(self, damping: float, box: Box | None = None) -> ReducedStep | None:
         """δ (rows, 6) with (S + λD) δ = side, in a box the best; None where S + λD is not positive definite or δ not

@@ -53,7 +53,7 @@ class RefinementConfig:
     distortion_bounds: tuple[float, float] | None = None
     """What each parameter of a distortion may be at least and at most."""
     sensors: bool = False
-    """The poses of cameras on their rigs may change. Residuals alone move these; measurements move rigs as a whole."""
+    """The poses of cameras on their rigs may change."""
     poses: bool = True
     """Poses may change."""
     points: bool = True
