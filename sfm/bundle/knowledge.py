@@ -13,13 +13,12 @@ import numpy as np
 
 from sfm.bundle.gauge import frame_centers
 from sfm.bundle.layout import Layout
+from sfm.bundle.mounted_terms import by_sensors, on_frames
 from sfm.bundle.prior_terms import (
     PriorTerms,
     bias_count,
-    by_sensors,
     linearize_point_priors,
     linearize_priors,
-    on_frames,
     point_prior_cost,
     prior_cost,
 )

@@ -217,7 +217,7 @@ class MotionSystem:
         both = np.flatnonzero((one >= 0) & (two >= 0))
         coupling = H[both, BLOCK:, :BLOCK]
         coupling = np.where((two > one)[both, None, None], coupling, coupling.swapaxes(1, 2))
-        np.add.at(blocks, _numbers(self._pattern, np.maximum(one, two)[both], np.minimum(one, two)[both]), coupling)
+        np.add.at(blocks, self._pattern.find(np.maximum(one, two)[both], np.minimum(one, two)[both]), coupling)
         return blocks, gradient
 
 
@@ -254,10 +254,3 @@ def _jobs(offsets: np.ndarray) -> list[tuple[int, int]]:
     """Ranges of pairs with about the same number of matches."""
     edges = np.searchsorted(offsets, [last for _, last in chunk_bounds(int(offsets[-1]), _CHUNKS)])
     return [(int(a), int(b)) for a, b in itertools.pairwise([0, *edges]) if a < b]
-
-
-def _numbers(pattern: BlockPattern, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The numbers of blocks that the pattern has."""
-    wide = np.int64(pattern.rows)
-    keys = np.repeat(np.arange(pattern.rows), np.diff(pattern.offsets)) * wide + pattern.columns
-    return np.searchsorted(keys, rows * wide + columns)

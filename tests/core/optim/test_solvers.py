@@ -14,7 +14,6 @@ from sfm.core.optim import dense_cholesky, sparse_cholesky
 from sfm.core.optim.block_pattern import BlockPattern
 from sfm.core.optim.cholmod import CholmodCholesky
 from sfm.core.optim.dense_cholesky import DenseCholesky
-from sfm.core.optim.preconditioners import BlockJacobi
 from sfm.core.optim.solvers import ReducedSolver, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
 from sfm.core.optim.sparse_cholesky import SparseCholesky
 from sfm.core.optional import import_cholmod
@@ -143,7 +142,7 @@ def test_rows_on_their_own_are_solved_by_all_alike(rng):
     pattern, S = random_system(rng, 30, 0)
     held, damping, side = rng.random(180) < 0.3, rng.random(180), rng.normal(size=180)
     held[:6] = True
-    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+    for kind in (SparseCholesky, DenseCholesky):
         solver = kind(pattern, held)
         assert solver.factor(lower_blocks(S, pattern), damping, 1)
         np.testing.assert_allclose(solver.solve(side), reference(S, damping, held, side), rtol=0, atol=1e-13)
@@ -151,7 +150,7 @@ def test_rows_on_their_own_are_solved_by_all_alike(rng):
 
 def test_all_solvers_are_reduced_solvers():
     pattern, held = BlockPattern.full(2), np.zeros(12, bool)
-    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+    for kind in (SparseCholesky, DenseCholesky):
         assert isinstance(kind(pattern, held), ReducedSolver)
 
 
