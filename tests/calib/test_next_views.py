@@ -5,7 +5,7 @@ import pytest
 
 from calib.next_views import camera_uncertainty, suggest_views
 from calib.refine import Calibration, CalibrationConfig, calibrate
-from calib.uncertainty import covariance
+from calib.uncertainty import CalibrationCovariance, covariance
 from sfm.core.cameras import Camera
 from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen
 
@@ -19,6 +19,12 @@ def calibrated(views) -> Calibration:
     return found
 
 
+def shared_of(found: Calibration) -> np.ndarray:
+    covariances = covariance(found)
+    assert isinstance(covariances, CalibrationCovariance)
+    return covariances.shared
+
+
 @pytest.fixture
 def few(rng):
     """A calibration from views in the middle of the image, and these."""
@@ -29,30 +35,30 @@ def few(rng):
 def test_suggested_views_keep_their_promise(few, rng):
     """With photos of the boards where they are suggested the camera is as certain as was foretold."""
     found, views = few
-    suggested = suggest_views(found.camera, found.columns, covariance(found).shared, found.sigma_px, BOARD)
+    suggested = suggest_views(found.camera, found.columns, shared_of(found), found.sigma_px, BOARD)
     assert len(suggested) == 3
-    before = camera_uncertainty(found.camera, found.columns, covariance(found).shared)
+    before = camera_uncertainty(found.camera, found.columns, shared_of(found))
     assert suggested[0].before_px == pytest.approx(before, rel=1e-6)
     assert suggested[2].after_px < suggested[1].after_px < suggested[0].after_px < 0.7 * before
     more = seen(LENS, BOARD, [view.cam_from_board for view in suggested], rng)
     more = [type(view)(f"next{k}", *[getattr(view, f) for f in ("width", "height", "corner_ids", "points2D")])
             for k, view in enumerate(more)]  # fmt: skip
     again = calibrated([*views, *more])
-    after = camera_uncertainty(again.camera, again.columns, covariance(again).shared)
+    after = camera_uncertainty(again.camera, again.columns, shared_of(again))
     assert after == pytest.approx(suggested[2].after_px * again.sigma_px / found.sigma_px, rel=0.1)
 
 
 def test_they_are_worth_more_than_more_of_the_same(few, rng):
     found, _ = few
-    suggested = suggest_views(found.camera, found.columns, covariance(found).shared, found.sigma_px, BOARD, count=1)
+    suggested = suggest_views(found.camera, found.columns, shared_of(found), found.sigma_px, BOARD, count=1)
     same = seen(LENS, BOARD, poses_before(LENS, 7, rng, tilt=0.4, reach=0.05), rng)
     more = calibrated(same)
-    assert suggested[0].after_px < camera_uncertainty(more.camera, more.columns, covariance(more).shared)
+    assert suggested[0].after_px < camera_uncertainty(more.camera, more.columns, shared_of(more))
 
 
 def test_suggested_boards_are_in_the_image_whole_and_apart(few):
     found, _ = few
-    suggested = suggest_views(found.camera, found.columns, covariance(found).shared, found.sigma_px, BOARD)
+    suggested = suggest_views(found.camera, found.columns, shared_of(found), found.sigma_px, BOARD)
     for view in suggested:
         assert np.all((view.points2D > 0) & (view.points2D < [LENS.width, LENS.height]))
         projected, valid = found.camera.project(view.cam_from_board @ BOARD)
