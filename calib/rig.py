@@ -21,7 +21,7 @@ from calib.refine_board import BoardShape, ShapeKind
 from calib.refine_fit import CalibrationConfig
 from calib.refine_reject import RejectedView
 from calib.rig_alone import AloneCamera, camera_alone, shape_of
-from calib.rig_poses import BoardTurn, FirstPoses, first_poses, turn_of
+from calib.rig_poses import BoardTurn, CameraFrames, FirstPoses, first_poses, turn_of
 from calib.rig_reject import RigFit, reject_from_rig
 from calib.rig_system import RigEstimate, RigSystem
 from calib.rig_views import RigCamera, RigObservations
@@ -34,6 +34,8 @@ from sfm.core.optim.levenberg_marquardt import Summary
 
 __all__ = ["RigCalibration", "RigConfig", "calibrate_rig"]
 
+_MISFIT = 1.5
+"""Noise of the rig over that of its cameras alone that is worth a word."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
 
@@ -146,7 +148,7 @@ class RigCalibration(Value):
     @property
     def fit(self) -> RigFit:
         """To fit again, with other views."""
-        return RigFit(True, 500, 1e-12, math.inf, math.inf, 0, tuple(self.columns))
+        return RigFit(True, 500, 1e-12, math.inf, math.inf, 0, math.inf, tuple(self.columns))
 
     @property
     def calibrations(self) -> tuple[Calibration | None, ...]:
@@ -177,7 +179,8 @@ def calibrate_rig(
     names = tuple(one.name for one in cameras)
     if len(names) < 2 or len(set(names)) < len(names):
         raise ValueError(f"expected two or more cameras of different names, got {', '.join(names)}")
-    if copied := _same_photos(cameras):
+    copied = _same_photos(cameras)
+    if copied is not None:
         return copied
     alone = []
     for one in cameras:
@@ -205,7 +208,7 @@ def calibrate_rig(
             return rejected
         system, summary = rejected
     apart = _unconnected(names, system.observations, config.min_frames, views)
-    if apart:
+    if apart is not None:
         return apart
     return _result(names, alone, fit, system, summary, first, turns, frames, views, corners)
 
@@ -214,9 +217,14 @@ def _fit(config: RigConfig, alone: Sequence[AloneCamera]) -> RigFit:
     held = np.zeros(0, np.int64)
     return RigFit(
         config.keep_invertible, config.max_iterations, config.relative_cost_tolerance, config.reject_beyond_sigma,
-        config.keep_within_sigma, config.min_corners,
+        config.keep_within_sigma, config.min_corners, _typical_sigma(alone),
         tuple(one.columns if config.refine_intrinsics or one.calibration is None else held for one in alone),
     )  # fmt: skip
+
+
+def _typical_sigma(alone: Sequence[AloneCamera]) -> float:
+    """Of the corners of cameras alone, in whose units residuals are whitened."""
+    return float(np.median([one.sigma_px for one in alone]))
 
 
 def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
@@ -233,15 +241,21 @@ def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
 def _first(
     board: Points3D, alone: Sequence[AloneCamera], frames: tuple[str, ...], turns: Sequence[BoardTurn], min_frames: int
 ) -> FirstPoses | Rejected:
-    at = {frame: f for f, frame in enumerate(frames)}
-    poses, corners = [], []
+    seen = []
     for one in alone:
-        counts = np.diff(one.observations.offsets).tolist()
-        poses.append({at[frame]: one.cams_from_board[v] for v, frame in enumerate(one.frames)})
-        corners.append({at[frame]: counts[v] for v, frame in enumerate(one.frames)})
+        at = _positions(frames, one.frames)
+        order = np.argsort(at)
+        corners = np.bincount(at, np.diff(one.observations.offsets), len(frames)).astype(np.int64)
+        seen.append(CameraFrames(at[order], one.cams_from_board[order], corners))
     low, high = board.min(0), board.max(0)
     probes = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-    return first_poses(tuple(one.name for one in alone), poses, corners, turns, probes, min_frames)
+    return first_poses(tuple(one.name for one in alone), seen, turns, probes, min_frames)
+
+
+def _positions(frames: tuple[str, ...], some: tuple[str, ...]) -> np.ndarray:
+    """Of some frames among all."""
+    at = {frame: f for f, frame in enumerate(frames)}
+    return np.array([at[frame] for frame in some], np.int64)
 
 
 def _gathered(
@@ -249,19 +263,16 @@ def _gathered(
     turns: Sequence[BoardTurn], config: RigConfig,
 ) -> tuple[RigObservations, RigEstimate]:  # fmt: skip
     """All views, read from the same side and weighted, with where everything is at first."""
-    at = {frame: f for f, frame in enumerate(frames)}
-    typical = float(np.median([one.sigma_px for one in alone]))
+    typical = _typical_sigma(alone)
     cameras, frame_of = [], []
     for c, one in enumerate(alone):
         o = one.observations
-        rows = o.rows.copy()
-        for v, frame in enumerate(one.frames):
-            part = slice(o.offsets[v], o.offsets[v + 1])
-            rows[part] = turns[first.turns[c][at[frame]]].rows[rows[part]]
+        at = _positions(frames, one.frames)
+        rows = np.stack([turn.rows for turn in turns])[first.turns[c][at][o.view_of], o.rows]
         weight = typical / one.sigma_px if config.weigh_cameras else 1.0
         cameras.append(dataclasses.replace(o, rows=rows, roots=weight * o.roots, board=board))
-        frame_of.append(np.array([at[frame] for frame in one.frames], np.int64))
-    poses = Rigid3.stack([first.rigs_from_board[f] for f in range(len(frames))])
+        frame_of.append(at)
+    poses = first.rigs_from_board
     estimate = RigEstimate(
         tuple(one.camera for one in alone), first.cams_from_rig.rotation.matrix,
         np.array(first.cams_from_rig.translation), poses.rotation.matrix, np.array(poses.translation),
@@ -303,6 +314,7 @@ def _result(
     unknown = 6 * len(observations.frames) + system.shared_count
     freedom = 2 * observations.corner_count - unknown
     total = sum(float(np.sum(r**2)) for r in residuals)
+    sigma = math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan
     return RigCalibration(
         names=names,
         cameras=estimate.cameras,
@@ -316,22 +328,30 @@ def _result(
         observations=observations,
         residuals=tuple(residuals),
         alone=tuple(alone),
-        turned=tuple(tuple(frames[f] for f, turn in sorted(chosen.items()) if turn) for chosen in first.turns),
+        turned=tuple(tuple(frames[f] for f in np.flatnonzero(chosen)) for chosen in first.turns),
         rejected_views=tuple(tuple(one) for one in views),
         rejected_corners=tuple(tuple(one) for one in corners),
         rms_px=math.sqrt(total / observations.corner_count),
-        sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
-        fallbacks=_fallbacks(names, alone, first),
+        sigma_px=sigma,
+        fallbacks=_fallbacks(names, alone, first, sigma),
         converged=system.newton_decrement() <= _CONVERGED * summary.final_cost + _EXACT * observations.corner_count,
         iterations=len(summary.iterations) - 1,
         cost=summary.final_cost,
     )
 
 
-def _fallbacks(names: tuple[str, ...], alone: Sequence[AloneCamera], first: FirstPoses) -> tuple[str, ...]:
+def _fallbacks(
+    names: tuple[str, ...], alone: Sequence[AloneCamera], first: FirstPoses, sigma_px: float
+) -> tuple[str, ...]:
     doubts = [
         f"{names[i]} and {names[j]}: the views do not tell which end of the board is which; the smaller turn between "
         "the cameras was taken"
         for i, j in first.doubtful
     ]
+    typical = _typical_sigma(alone)
+    if sigma_px > _MISFIT * typical:
+        doubts.append(
+            f"together corners are off by {sigma_px:.2f} px, alone by {typical:.2f} px: the cameras moved against each "
+            "other, or photos of one frame were not taken at one moment"
+        )
     return (*doubts, *(words for one in alone for words in one.fallbacks))

@@ -19,7 +19,7 @@ Relative poses are compared by the angle at which camera 2 sees apart where they
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -37,6 +37,7 @@ _CAP = 0.1
 _CANDIDATES = 60
 _AGREEING = 3.0
 """Times the median angle of the frames that agree within which one counts for the average."""
+_AVERAGING = 4
 _TOLD_APART = 2.0
 """A turn of the board is told from another if its frames agree by this factor better."""
 
@@ -97,52 +98,74 @@ def relative_pose(
 
     Args:
         cam1_from_board, cam2_from_board: batches (F,) of the same frames.
+        turns: of the board, the first is none.
         probes: (M, 3) points of the board by which poses are compared.
     """
-    frames, readings = len(cam1_from_board), len(turns)
-    seen1 = cam1_from_board.rotation.matrix @ probes.T + cam1_from_board.translation[:, :, None]
-    read = [cam2_from_board @ _repeated(turn.motion.inverse(), frames) for turn in turns]
-    seen2 = np.stack([pose.rotation.matrix @ probes.T + pose.translation[:, :, None] for pose in read])
-    depth = np.linalg.norm(seen2, axis=2).mean(2)
-    tried = [pose @ cam1_from_board.inverse() for pose in read]
-    some = np.unique(np.linspace(0, frames - 1, min(frames, max(_CANDIDATES // readings, 8))).astype(int))
-
-    def angles(motion: Rigid3) -> FloatArray:
-        """(G, F) of all readings."""
-        put = np.einsum("ij,fjm->fim", motion.rotation.matrix, seen1) + motion.translation[:, None]
-        return np.sqrt(np.mean(np.sum((put - seen2) ** 2, axis=2), axis=2)) / depth
-
-    scored = []
-    for g, motions in enumerate(tried):
-        for f in some.tolist():
-            apart = angles(motions[f])
-            score = float(np.minimum(apart.min(0), _CAP).sum())
-            scored.append((score, float(motions.rotation.angle[f]), g, f, tuple(apart.argmin(0).tolist())))
-    best = min(scored)
-    alike = [one for one in scored if one[0] <= _TOLD_APART * best[0] + 1e-9 * frames]
-    doubtful = len({one[4] for one in alike}) > 1
-    _, _, g, f, _ = min(alike, key=lambda one: one[1]) if doubtful else best
-    motion = tried[g][f]
-    for _ in range(5):
-        apart = angles(motion)
-        chosen = apart.argmin(0)
-        own = Rigid3.stack([tried[h][k] for k, h in enumerate(chosen)])
-        motion = _average(motion, own, apart.min(0))
-    apart = angles(motion)
-    return RelativePose(motion, apart.argmin(0).astype(np.int64), apart.min(0), doubtful)
+    frames = len(cam1_from_board)
+    pose1, pose2, points = _square(cam1_from_board), _square(cam2_from_board), _homogeneous(probes)
+    read = pose2 @ _untwisted(turns)[:, None]
+    tried, seen1, seen2 = read @ np.linalg.inv(pose1), pose1 @ points, read @ points
+    depth = np.linalg.norm(seen2[:, :, :3], axis=2).mean(2)
+    some = np.unique(np.linspace(0, frames - 1, min(frames, max(_CANDIDATES // len(turns), 8))).astype(int))
+    candidates = tried[:, some].reshape(-1, 4, 4)
+    apart = _angles(candidates, seen1, seen2, depth)
+    choices, scores = apart.argmin(1), np.minimum(apart.min(1), _CAP).sum(1)
+    alike = np.flatnonzero(scores <= _TOLD_APART * scores.min() + 1e-9 * frames)
+    doubtful = len(np.unique(choices[alike], axis=0)) > 1
+    if doubtful:  # trace R = 1 + 2 cos: the smallest turn between the cameras
+        best = alike[np.argmax(np.trace(candidates[alike, :3, :3], axis1=1, axis2=2))]
+    else:
+        best = int(np.argmin(scores))
+    motion = candidates[best]
+    for _ in range(_AVERAGING):
+        apart = _angles(motion[None], seen1, seen2, depth)[0]
+        motion = _average(motion, tried[apart.argmin(0), np.arange(frames)], apart.min(0))
+    apart = _angles(motion[None], seen1, seen2, depth)[0]
+    return RelativePose(Rigid3.from_matrix(motion), apart.argmin(0), apart.min(0), doubtful)
 
 
-def _repeated(motion: Rigid3, count: int) -> Rigid3:
-    return Rigid3.stack([motion] * count)
+def _angles(motions: FloatArray, seen1: FloatArray, seen2: FloatArray, depth: FloatArray) -> FloatArray:
+    """(C, G, F) at which camera 2 sees apart what it saw and what camera 1 saw, moved there."""
+    off = motions[:, None, None] @ seen1 - seen2
+    return np.sqrt(np.mean(np.sum(off * off, axis=3), axis=3)) / depth
 
 
-def _average(motion: Rigid3, own: Rigid3, apart: Vector) -> Rigid3:
-    """One step to the least sum of distances from the motions that agree."""
+def _average(motion: FloatArray, own: FloatArray, apart: Vector) -> FloatArray:
+    """One step to the least sum of distances from the motions (F, 4, 4) that agree."""
     typical = float(np.median(apart[apart < _CAP])) if np.any(apart < _CAP) else _CAP
     weights = np.where(apart <= _AGREEING * typical + 1e-12, 1 / np.maximum(apart, 1e-9), 0.0)
-    steps = (own.rotation @ _repeated(motion.inverse(), len(own)).rotation).log()
-    turn = Rotation3.exp(weights @ steps / weights.sum())
-    return Rigid3(turn @ motion.rotation, weights @ own.translation / weights.sum())
+    weights /= weights.sum()
+    steps = Rotation3.from_matrix(own[:, :3, :3] @ motion[:3, :3].T).log()
+    moved = np.eye(4)
+    moved[:3, :3] = Rotation3.exp(weights @ steps).matrix @ motion[:3, :3]
+    moved[:3, 3] = weights @ own[:, :3, 3]
+    return moved
+
+
+def _square(poses: Rigid3) -> FloatArray:
+    """Matrices (F, 4, 4)."""
+    out = np.zeros((*poses.shape, 4, 4))
+    out[..., :3, :], out[..., 3, 3] = poses.matrix, 1.0
+    return out
+
+
+def _homogeneous(points: Points3D) -> FloatArray:
+    """Columns (4, M)."""
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1).T
+
+
+def _untwisted(turns: Sequence[BoardTurn]) -> FloatArray:
+    """(G, 4, 4): a pose times one of them is that of the board read after the turn."""
+    return np.linalg.inv(np.stack([_square(turn.motion) for turn in turns]))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CameraFrames(Value):
+    """Of one camera by itself the poses `cams_from_board` (V,) in some of F frames, and its corners in all (F,)."""
+
+    frames: Int64[np.ndarray, " V"]
+    cams_from_board: Rigid3
+    corners: Int64[np.ndarray, " F"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -161,34 +184,32 @@ class FirstPoses(Value):
 
     Attributes:
         cams_from_rig: (N,), the first is the identity.
-        rigs_from_board: by frame.
-        turns: of each camera, by frame, the turn by which it must read the board.
+        rigs_from_board: (F,).
+        turns: (N, F) by which the camera must read the board; 0 where it does not see it.
         tree: the connections that were used.
         doubtful: pairs of cameras of which the board's turn could not be told.
     """
 
     cams_from_rig: Rigid3
-    rigs_from_board: Mapping[int, Rigid3]
-    turns: tuple[Mapping[int, int], ...]
+    rigs_from_board: Rigid3
+    turns: Int64[np.ndarray, "C F"]
     tree: tuple[Connection, ...]
     doubtful: tuple[tuple[int, int], ...]
 
 
 def first_poses(
-    names: tuple[str, ...], poses: Sequence[Mapping[int, Rigid3]], corners: Sequence[Mapping[int, int]],
-    turns: Sequence[BoardTurn], probes: Points3D, min_frames: int,
-) -> FirstPoses | Rejected:  # fmt: skip
+    names: tuple[str, ...], seen: Sequence[CameraFrames], turns: Sequence[BoardTurn], probes: Points3D, min_frames: int
+) -> FirstPoses | Rejected:
     """Cameras along the spanning tree of most shared corners, then frames.
 
     Args:
         names: of the cameras.
-        poses: of each camera `cam_from_board` by frame.
-        corners: how many each camera sees in it.
+        seen: by each of them; every frame is seen by one at least.
         min_frames: that two cameras must share to be connected.
     Returns:
         `cameras_not_connected`, with the groups that are.
     """
-    connections = _connections(poses, corners)
+    connections = _connections(seen)
     strong = [one for one in connections if len(one.frames) >= min_frames]
     edges = np.array([(one.camera1, one.camera2) for one in strong], np.int64).reshape(-1, 2)
     groups = connected_components(len(names), edges)
@@ -196,79 +217,81 @@ def first_poses(
         return Rejected("cameras_not_connected", _told_apart(names, groups, connections, min_frames))
     rows = maximum_spanning_tree(len(names), edges, np.array([one.corners for one in strong], np.int64))
     tree = tuple(strong[row] for row in rows)
-    found = {
-        (one.camera1, one.camera2): relative_pose(
-            Rigid3.stack([poses[one.camera1][f] for f in one.frames.tolist()]),
-            Rigid3.stack([poses[one.camera2][f] for f in one.frames.tolist()]),
-            turns,
-            probes,
-        )
-        for one in tree
-    }
-    cams_from_rig = _along(tree, {pair: relative.cam2_from_cam1 for pair, relative in found.items()}, len(names))
-    rigs_from_board, chosen = _frames(cams_from_rig, poses, corners, turns, probes)
-    doubtful = tuple(pair for pair, relative in found.items() if relative.doubtful)
-    return FirstPoses(Rigid3.stack(cams_from_rig), rigs_from_board, chosen, tree, doubtful)
+    found = [relative_pose(_at(seen[one.camera1], one), _at(seen[one.camera2], one), turns, probes) for one in tree]
+    mounts = _along(tree, [_square(relative.cam2_from_cam1) for relative in found], len(names))
+    poses, chosen = _frames(mounts, seen, turns, probes)
+    doubtful = [(one.camera1, one.camera2) for one, relative in zip(tree, found, strict=True) if relative.doubtful]
+    return FirstPoses(Rigid3.from_matrix(mounts), Rigid3.from_matrix(poses), chosen, tree, tuple(doubtful))
 
 
-def _connections(poses: Sequence[Mapping[int, Rigid3]], corners: Sequence[Mapping[int, int]]) -> list[Connection]:
+def _connections(seen: Sequence[CameraFrames]) -> list[Connection]:
     found = []
-    for i in range(len(poses)):
-        for j in range(i + 1, len(poses)):
-            frames = sorted(poses[i].keys() & poses[j].keys())
-            if frames:
-                shared = sum(min(corners[i][f], corners[j][f]) for f in frames)
-                found.append(Connection(i, j, np.array(frames, np.int64), shared))
+    for i, one in enumerate(seen):
+        for j, other in enumerate(seen[i + 1 :], i + 1):
+            frames = np.intersect1d(one.frames, other.frames)
+            if len(frames):
+                shared = int(np.minimum(one.corners, other.corners)[frames].sum())
+                found.append(Connection(i, j, frames, shared))
     return found
+
+
+def _at(camera: CameraFrames, connection: Connection) -> Rigid3:
+    """Its poses in the frames of the connection."""
+    return camera.cams_from_board[np.flatnonzero(np.isin(camera.frames, connection.frames))]
 
 
 def _told_apart(
     names: tuple[str, ...], groups: Sequence[np.ndarray], connections: list[Connection], needed: int
 ) -> str:
     told = " | ".join(", ".join([names[c] for c in group.tolist()]) for group in groups)
-    weak = [f"{names[one.camera1]} and {names[one.camera2]} share {len(one.frames)}" for one in connections
-            if len(one.frames) < needed]  # fmt: skip
+    weak = [
+        f"{names[one.camera1]} and {names[one.camera2]} share {len(one.frames)}"
+        for one in connections
+        if len(one.frames) < needed
+    ]
     count = f"{needed} frames that show the board to both are needed to connect two cameras"
     return f"{told}: {count}" + (f"; {', '.join(weak)}" if weak else "; they share none")
 
 
-def _along(tree: Sequence[Connection], relative: Mapping[tuple[int, int], Rigid3], count: int) -> list[Rigid3]:
-    """`cams_from_rig` by composition from the first camera."""
-    known = {0: Rigid3.identity()}
+def _along(tree: Sequence[Connection], relative: Sequence[FloatArray], count: int) -> FloatArray:
+    """`cams_from_rig` (N, 4, 4) by composition from the first camera."""
+    known = {0: np.eye(4)}
     while len(known) < count:
-        for one in tree:
+        for one, motion in zip(tree, relative, strict=True):
             i, j = one.camera1, one.camera2
             if i in known and j not in known:
-                known[j] = relative[i, j] @ known[i]
+                known[j] = motion @ known[i]
             elif j in known and i not in known:
-                known[i] = relative[i, j].inverse() @ known[j]
-    return [known[c] for c in range(count)]
+                known[i] = np.linalg.inv(motion) @ known[j]
+    return np.stack([known[c] for c in range(count)])
 
 
 def _frames(
-    cams_from_rig: list[Rigid3], poses: Sequence[Mapping[int, Rigid3]], corners: Sequence[Mapping[int, int]],
-    turns: Sequence[BoardTurn], probes: Points3D,
-) -> tuple[dict[int, Rigid3], tuple[dict[int, int], ...]]:  # fmt: skip
-    """Of each frame the pose on which its views agree best, and the turns by which they do.
+    mounts: FloatArray, seen: Sequence[CameraFrames], turns: Sequence[BoardTurn], probes: Points3D
+) -> tuple[FloatArray, Int64[np.ndarray, "C F"]]:
+    """Of each frame the pose on which its views agree best (F, 4, 4), and the turns by which they do.
 
     The camera with the most corners reads the board as it did.
     """
-    rigs_from_board, chosen = {}, tuple({} for _ in poses)
-    for f in sorted({f for one in poses for f in one}):
-        views = sorted((c for c in range(len(poses)) if f in poses[c]), key=lambda c: (-corners[c][f], c))
-        put: list[Rigid3] = []
-        for c in views:
-            read = [cams_from_rig[c].inverse() @ poses[c][f] @ turn.motion.inverse() for turn in turns]
-            apart = [_apart(one, put[0], probes) if put else 0.0 for one in read]
-            chosen[c][f] = int(np.argmin(apart)) if put else 0
-            put.append(read[chosen[c][f]])
-        totals = [sum(min(_apart(one, other, probes), _CAP) for other in put) for one in put]
-        rigs_from_board[f] = put[int(np.argmin(totals))]
-    return rigs_from_board, chosen
+    corners, untwisted, points = np.stack([one.corners for one in seen]), _untwisted(turns), _homogeneous(probes)
+    count = corners.shape[1]
+    every, anchor = np.arange(count), corners.argmax(0)
+    read = np.full((len(seen), len(turns), count, 4, 4), np.nan)
+    for c, one in enumerate(seen):
+        read[c][:, one.frames] = np.linalg.inv(mounts[c]) @ _square(one.cams_from_board) @ untwisted[:, None]
+    put = read @ points
+    first = put[anchor, 0, every]
+    depth = np.linalg.norm(first[:, :3], axis=1).mean(1)
+    apart = _spread(put - first) / depth
+    chosen = np.where(np.isnan(apart), np.inf, apart).argmin(1)
+    chosen[anchor, every] = 0
+    best = put[np.arange(len(seen))[:, None], chosen, every]
+    # A view that is not there is as far from all others as can be.
+    between = np.minimum(np.nan_to_num(_spread(best[:, None] - best[None]) / depth, nan=_CAP), _CAP)
+    medoid = np.where(corners > 0, between.sum(1), np.inf).argmin(0)
+    return read[medoid, chosen[medoid, every], every], chosen.astype(np.int64)
 
 
-def _apart(pose1: Rigid3, pose2: Rigid3, probes: Points3D) -> float:
-    """How far apart the board's points are, over their distance from the rig."""
-    points1, points2 = pose1 @ probes, pose2 @ probes
-    off = np.sqrt(np.mean(np.sum((points1 - points2) ** 2, axis=1)))
-    return float(off / max(np.linalg.norm(points2, axis=1).mean(), 1e-300))
+def _spread(off: FloatArray) -> FloatArray:
+    """Root of the mean squared length of columns (..., 4, M)."""
+    return np.sqrt(np.mean(np.sum(off * off, axis=-2), axis=-1))

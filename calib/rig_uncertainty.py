@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float64
 
 from calib.rig import RigCalibration
 from calib.rig_system import RigSystem
+from calib.rig_views import RigObservations
 from sfm.core.arrays import FloatArray, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
@@ -167,19 +169,24 @@ class RigHeldOut(Value):
 
     Attributes:
         frames: those that two cameras or more saw.
-        rms_px: root of the mean squared length of their residuals, with the rig of the other frames and their own
-            poses.
-        training_rms_px: of the same frames in fits that knew them.
+        squares: (S,) mean squared length of the residuals of each, px², with the rig of the other frames and its own
+            pose.
+        counts: (S,) corners.
+        training_rms_px: of the same frames in the fit that knew them.
     """
 
     frames: tuple[str, ...]
-    rms_px: float
+    squares: Float64[np.ndarray, " S"]
+    counts: Float64[np.ndarray, " S"]
     training_rms_px: float
 
+    @property
+    def rms_px(self) -> float:
+        """Over all corners."""
+        return math.sqrt(float(self.squares @ self.counts / self.counts.sum()))
 
-def hold_out_frames(
-    found: RigCalibration, *, folds: int = 5, rng: np.random.Generator
-) -> RigHeldOut | Rejected:  # fmt: skip
+
+def hold_out_frames(found: RigCalibration, *, folds: int = 5, rng: np.random.Generator) -> RigHeldOut | Rejected:
     """Errors of the frames of a rig, each held out once, at the corners that it kept.
 
     Returns:
@@ -191,7 +198,7 @@ def hold_out_frames(
     if folds < 2:
         return Rejected("too_few_frames", f"{len(shared)} frames seen by two cameras")
     order, fit = rng.permutation(shared), found.fit
-    squares = count = 0.0
+    squares, counts = np.zeros(len(observations.frames)), np.zeros(len(observations.frames))
     for fold in range(folds):
         held = np.sort(order[fold::folds])
         rest = np.setdiff1d(np.arange(len(observations.frames)), held)
@@ -208,19 +215,22 @@ def hold_out_frames(
         none = [np.zeros(0, np.int64)] * len(rig.cameras)
         judge = RigSystem(there, placed, none, free_mounts=False)
         minimize(judge, _POSES)
-        squares += sum(float(np.sum(r**2)) for r in judge.residuals())
-        count += there.corner_count
+        sums, known = frame_sums(there, judge.residuals())
+        squares[left], counts[left] = sums, known
+    trained, known = frame_sums(observations, found.residuals)
     return RigHeldOut(
         frames=tuple(observations.frames[f] for f in shared),
-        rms_px=math.sqrt(squares / count),
-        training_rms_px=_training_rms(found, shared),
+        squares=squares[shared] / counts[shared],
+        counts=counts[shared],
+        training_rms_px=math.sqrt(float(trained[shared].sum() / known[shared].sum())),
     )
 
 
-def _training_rms(found: RigCalibration, shared: np.ndarray) -> float:
-    squares = count = 0.0
-    for r, camera, frames in zip(found.residuals, found.observations.cameras, found.observations.frame_of, strict=True):
-        inside = np.isin(frames, shared)[camera.view_of]
-        squares += float(np.sum(r[inside] ** 2))
-        count += float(inside.sum())
-    return math.sqrt(squares / count)
+def frame_sums(observations: RigObservations, residuals: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Of each frame the sum of squared lengths of residuals, px², and the number of corners."""
+    sums, counts = np.zeros(len(observations.frames)), np.zeros(len(observations.frames))
+    for r, camera, frames in zip(residuals, observations.cameras, observations.frame_of, strict=True):
+        of_corner = frames[camera.view_of]
+        sums += np.bincount(of_corner, np.sum(r**2, axis=1), len(sums))
+        counts += np.bincount(of_corner, minlength=len(sums))
+    return sums, counts
