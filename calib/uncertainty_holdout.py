@@ -36,6 +36,8 @@ from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
 _POSES = StopRules(max_iterations=50, relative_cost_tolerance=1e-10, gradient_tolerance=0.0)
+_NEGLIGIBLE = 0.02
+"""Part of the squared error: a hundredth of the error is no reason for another coefficient."""
 CANDIDATES = ("pinhole", "simple_radial", "radial", "opencv4", "opencv5", "opencv8", "fisheye", "eucm")
 
 
@@ -170,7 +172,8 @@ def choose_lens(
 ) -> tuple[RankedLens, ...] | Rejected:  # fmt: skip
     """Lens models ranked by the error of held-out views, the chosen one first.
 
-    The chosen one has the fewest coefficients of those that converged to an error within a standard error of the least.
+    The chosen one has the fewest coefficients of those that converged to an error within a standard error, or a
+    hundredth, of the least.
     Corners that the best fitting model leaves out are left out for all, so that all are judged by the same.
 
     Returns:
@@ -228,7 +231,10 @@ def _common_corners(
 
 
 def _ranked(rows: list[RankedLens], held: dict[str, HeldOut]) -> tuple[RankedLens, ...]:
-    best = min(held, key=lambda name: held[name].rms_px)
+    # One that did not converge, or has no rays where no board was shown, has coefficients that the photos cannot bear.
+    sound = [row.lens for row in rows if row.lens in held and row.converged and _sees_whole_image(row)]
+    sound = sound or [row.lens for row in rows if row.lens in held and row.converged] or list(held)
+    best = min(sound, key=lambda name: held[name].rms_px)
     judged = []
     for row in rows:
         if row.lens not in held:
@@ -237,14 +243,21 @@ def _ranked(rows: list[RankedLens], held: dict[str, HeldOut]) -> tuple[RankedLen
         excess = held[row.lens].squares - held[best].squares
         error = float(np.std(excess, ddof=1) / math.sqrt(len(excess))) if len(excess) > 1 else math.inf
         judged.append(dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error))
-    able = [row for row in judged if row.lens in held]
-    alike = [row for row in able if row.excess <= row.excess_error]
-    alike = [row for row in alike if row.converged] or alike
+    negligible = _NEGLIGIBLE * float(np.mean(held[best].squares))
+    alike = [row for row in judged if row.lens in sound and row.excess <= max(row.excess_error, negligible)]
     chosen = min(alike, key=lambda row: (row.coefficients, row.held_out_rms_px))
     rest = sorted(
         (row for row in judged if row is not chosen), key=lambda row: (bool(row.refused), row.held_out_rms_px)
     )
     return tuple(_compared(row, chosen) for row in (chosen, *rest))
+
+
+def _sees_whole_image(row: RankedLens) -> bool:
+    """Whether there is a ray for each corner of the image; of fisheyes, whose circle may end before, always."""
+    if row.calibration is None or row.calibration.camera.model_info.is_fisheye:
+        return row.calibration is not None
+    w, h = float(row.calibration.camera.width), float(row.calibration.camera.height)
+    return bool(row.calibration.camera.unproject(np.array([[0, 0], [w, 0], [0, h], [w, h]]))[1].all())
 
 
 def _compared(row: RankedLens, chosen: RankedLens) -> RankedLens:

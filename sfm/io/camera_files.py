@@ -90,7 +90,19 @@ def _read_toml(path: Path) -> Camera:
     table = document.get("camera")
     if not isinstance(table, dict):
         raise ConfigError("has no table [camera]", path=path)
-    _check_keys(table, _KEYS, path)
+    return camera_from_table(table, path)
+
+
+def camera_from_table(table: dict[str, Any], path: Path, *, further: tuple[str, ...] = ()) -> Camera:
+    """The camera of a table [camera] of a TOML file.
+
+    Args:
+        path: of the file, for errors.
+        further: keys that are allowed beside those of a camera.
+    Raises:
+        ConfigError: a key is unknown, missing or out of its range.
+    """
+    _check_keys(table, (*_KEYS, *further), path)
     missing = [key for key in _REQUIRED if key not in table]
     if missing:
         raise ConfigError(f"[camera] lacks {', '.join(missing)}", path=path)

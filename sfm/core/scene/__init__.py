@@ -3,9 +3,10 @@
 from sfm.core.scene.features import DescriptorKind, Features, Matches
 from sfm.core.scene.pairs import PairKind, TwoViewGeometry, ViewGraph
 from sfm.core.scene.reconstruction import Reconstruction, Tracks
-from sfm.core.scene.rigs import Frame, Rig
+from sfm.core.scene.rigs import CameraRig, Frame, Rig
 
 __all__ = [
+    "CameraRig",
     "DescriptorKind",
     "Features",
     "Frame",

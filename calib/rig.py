@@ -1,0 +1,340 @@
+"""Calibration of cameras that are mounted together: from corners in frames to cameras, their poses, and doubts.
+
+    each camera alone (`rig_alone`)  →  relative poses by pairs, along a spanning tree (`rig_poses`)  →  all together
+    (`rig_system`)  →  reject (`rig_reject`)  →  verdict
+
+Not every camera need see the board in every frame, nor any two of them ever, as long as others connect them.
+The rig's frame is that of the first camera.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from calib.refine import Calibration
+from calib.refine_board import BoardShape, ShapeKind
+from calib.refine_fit import CalibrationConfig
+from calib.refine_reject import RejectedView
+from calib.rig_alone import AloneCamera, camera_alone, shape_of
+from calib.rig_poses import BoardTurn, CameraFrames, FirstPoses, first_poses, turn_of
+from calib.rig_reject import RigFit, reject_from_rig
+from calib.rig_system import RigEstimate, RigSystem
+from calib.rig_views import RigCamera, RigObservations
+from sfm.core.arrays import Points3D, Value
+from sfm.core.cameras import Camera
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.graphs.union_find import connected_components
+from sfm.core.optim.levenberg_marquardt import Summary
+
+__all__ = ["RigCalibration", "RigConfig", "calibrate_rig"]
+
+_CONVERGED, _EXACT = 1e-9, 1e-20
+"""Part of the cost, and px² a corner, that need not be gained."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class RigConfig:
+    """How a rig is calibrated."""
+
+    refine_intrinsics: bool = True
+    """Cameras that were calibrated here are refined together with the rig, which is the most probable solution;
+    otherwise they stay as each of them says alone."""
+    refine_known: bool = False
+    """Cameras that were given are refined as well."""
+    shape: ShapeKind = "flat"
+    """What the board may be; see `refine_board`."""
+    weigh_cameras: bool = True
+    """Corners of a camera weigh by the noise that it has alone. Otherwise a pixel is a pixel, as in OpenCV."""
+    min_frames: int = 3
+    """That two cameras must share to be connected; below it a wrong one could not be told."""
+    reject: bool = True
+    """Leave out corners and views that do not fit."""
+    min_corners: int = 6
+    """In a view."""
+    reject_beyond_sigma: float = 5.0
+    """A corner farther off starts the rejection."""
+    keep_within_sigma: float = 4.0
+    """What rejection then cuts at."""
+    max_iterations: int = 500
+    relative_cost_tolerance: float = 1e-12
+    keep_invertible: bool = True
+    """No corner may lie where a distortion turns back."""
+
+    def alone(self, lens: str) -> CalibrationConfig:
+        """For the calibration of one camera alone."""
+        return CalibrationConfig(
+            lens=lens,
+            shape=self.shape,
+            reject=self.reject,
+            min_corners=self.min_corners,
+            reject_beyond_sigma=self.reject_beyond_sigma,
+            keep_within_sigma=self.keep_within_sigma,
+            max_iterations=self.max_iterations,
+            relative_cost_tolerance=self.relative_cost_tolerance,
+            keep_invertible=self.keep_invertible,
+        )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigCalibration(Value):
+    """Cameras and how they stand, with what they were made from.
+
+    Attributes:
+        names: of the cameras; the rig's frame is that of the first.
+        cams_from_rig: batch (N,), in the board's unit; the first is the identity.
+        rigs_from_board: batch (F,), of the frames of `observations`.
+        free_names: of each camera the parameters that were estimated.
+        observations: of the views and corners that were used. Their weights contain those of the cameras.
+        residuals: of each camera (n, 2) projected − observed, px.
+        alone: each camera by itself.
+        turned: of each camera the frames in which it read the board from another side than the others.
+        rejected_views: by camera.
+        rejected_corners: by camera, as (name of the view, row of the board's point).
+        rms_px: root of the mean squared length of residuals over all corners.
+        sigma_px: standard deviation of one whitened coordinate, √(Σ r² / (2 n − parameters)).
+        fallbacks: what rests on little, in words.
+        converged: another step, undamped, promises less than a billionth of the cost.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    cams_from_rig: Rigid3
+    rigs_from_board: Rigid3
+    shape: BoardShape
+    free_names: tuple[tuple[str, ...], ...]
+    observations: RigObservations
+    residuals: tuple[Float64[np.ndarray, "_ 2"], ...]
+    alone: tuple[AloneCamera, ...]
+    turned: tuple[tuple[str, ...], ...]
+    rejected_views: tuple[tuple[RejectedView, ...], ...]
+    rejected_corners: tuple[tuple[tuple[str, int], ...], ...]
+    rms_px: float
+    sigma_px: float
+    fallbacks: tuple[str, ...]
+    converged: bool
+    iterations: int
+    cost: float
+
+    @property
+    def estimate(self) -> RigEstimate:
+        """As the solver wants it."""
+        mounts, frames = self.cams_from_rig, self.rigs_from_board
+        return RigEstimate(
+            self.cameras, mounts.rotation.matrix, np.array(mounts.translation), frames.rotation.matrix,
+            np.array(frames.translation), self.shape,
+        )  # fmt: skip
+
+    @property
+    def columns(self) -> list[np.ndarray]:
+        """Of each camera the positions of its free parameters."""
+        return [
+            np.flatnonzero([name in free for name in camera.model_info.param_names])
+            for camera, free in zip(self.cameras, self.free_names, strict=True)
+        ]
+
+    @property
+    def camera_rms_px(self) -> tuple[float, ...]:
+        """As `rms_px`, of each camera."""
+        return tuple(math.sqrt(float(np.mean(np.sum(r**2, axis=1)))) for r in self.residuals)
+
+    @property
+    def fit(self) -> RigFit:
+        """To fit again, with other views."""
+        return RigFit(True, 500, 1e-12, math.inf, math.inf, 0, tuple(self.columns))
+
+    @property
+    def calibrations(self) -> tuple[Calibration | None, ...]:
+        """Of each camera alone; None where it was known."""
+        return tuple(one.calibration for one in self.alone)
+
+    def system(self) -> RigSystem:
+        """The problem at its solution."""
+        free_shape = len(self.shape.coefficients) > 0
+        return RigSystem(self.observations, self.estimate, self.columns, free_shape=free_shape)
+
+
+def calibrate_rig(
+    board: Points3D, cameras: Sequence[RigCamera], config: RigConfig = RigConfig(), *, turns: Sequence[BoardTurn] = ()
+) -> RigCalibration | Rejected:
+    """The cameras that took photos of a board together.
+
+    Args:
+        board: (P, 3) its points in metres, or in any other unit; z = 0.
+        cameras: with their views; the first is the reference.
+        turns: of the board that nothing printed on it tells apart; see `board_turns`.
+    Returns:
+        `camera_without_board`, `too_few_views`, `undetermined_focal` … of a camera by itself, with its name;
+        `same_photos` where two cameras have the same corners; `cameras_not_connected` with the groups that are.
+    Raises:
+        ValueError: fewer than two cameras, two of one name, or what `calibrate` refuses.
+    """
+    names = tuple(one.name for one in cameras)
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise ValueError(f"expected two or more cameras of different names, got {', '.join(names)}")
+    if copied := _same_photos(cameras):
+        return copied
+    alone = []
+    for one in cameras:
+        found = camera_alone(board, one, config.alone(one.lens), config.refine_known)
+        if isinstance(found, Rejected):
+            return found
+        alone.append(found)
+    turns = tuple(turns) or tuple(turn for turn in [turn_of(board, 0)] if turn is not None)
+    frames = tuple(sorted({frame for one in alone for frame in one.frames}))
+    first = _first(board, alone, frames, turns, config.min_frames)
+    if isinstance(first, Rejected):
+        return first
+    fit = _fit(config, alone)
+    observations, estimate = _gathered(board, alone, frames, first, turns, config)
+    if not config.refine_intrinsics and config.shape == "flat":
+        observations, estimate = _shared_frames(observations, estimate)
+    system, summary = fit.solve(observations, estimate)
+    views: list[list[RejectedView]] = [list(one.rejected) for one in alone]
+    corners: list[list[tuple[str, int]]] = [
+        list(one.calibration.rejected_corners) if one.calibration else [] for one in alone
+    ]
+    if config.reject:
+        rejected = reject_from_rig(fit, system, summary, views, corners)
+        if isinstance(rejected, Rejected):
+            return rejected
+        system, summary = rejected
+    apart = _unconnected(names, system.observations, config.min_frames, views)
+    if apart:
+        return apart
+    return _result(names, alone, fit, system, summary, first, turns, frames, views, corners)
+
+
+def _fit(config: RigConfig, alone: Sequence[AloneCamera]) -> RigFit:
+    held = np.zeros(0, np.int64)
+    return RigFit(
+        config.keep_invertible, config.max_iterations, config.relative_cost_tolerance, config.reject_beyond_sigma,
+        config.keep_within_sigma, config.min_corners,
+        tuple(one.columns if config.refine_intrinsics or one.calibration is None else held for one in alone),
+    )  # fmt: skip
+
+
+def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
+    for i, one in enumerate(cameras):
+        seen = {view.points2D.tobytes(): view.name for view in one.views}
+        for other in cameras[i + 1 :]:
+            for view in other.views:
+                if view.points2D.tobytes() in seen:
+                    detail = f"{seen[view.points2D.tobytes()]} and {view.name} have the same corners to the last bit"
+                    return Rejected("same_photos", f"{one.name} and {other.name}: {detail}")
+    return None
+
+
+def _first(
+    board: Points3D, alone: Sequence[AloneCamera], frames: tuple[str, ...], turns: Sequence[BoardTurn], min_frames: int
+) -> FirstPoses | Rejected:
+    seen = []
+    for one in alone:
+        at = _positions(frames, one.frames)
+        order = np.argsort(at)
+        corners = np.bincount(at, np.diff(one.observations.offsets), len(frames)).astype(np.int64)
+        seen.append(CameraFrames(at[order], one.cams_from_board[order], corners))
+    low, high = board.min(0), board.max(0)
+    probes = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    return first_poses(tuple(one.name for one in alone), seen, turns, probes, min_frames)
+
+
+def _positions(frames: tuple[str, ...], some: tuple[str, ...]) -> np.ndarray:
+    """Of some frames among all."""
+    at = {frame: f for f, frame in enumerate(frames)}
+    return np.array([at[frame] for frame in some], np.int64)
+
+
+def _gathered(
+    board: Points3D, alone: Sequence[AloneCamera], frames: tuple[str, ...], first: FirstPoses,
+    turns: Sequence[BoardTurn], config: RigConfig,
+) -> tuple[RigObservations, RigEstimate]:  # fmt: skip
+    """All views, read from the same side and weighted, with where everything is at first."""
+    typical = float(np.median([one.sigma_px for one in alone]))
+    cameras, frame_of = [], []
+    for c, one in enumerate(alone):
+        o = one.observations
+        at = _positions(frames, one.frames)
+        rows = np.stack([turn.rows for turn in turns])[first.turns[c][at][o.view_of], o.rows]
+        weight = typical / one.sigma_px if config.weigh_cameras else 1.0
+        cameras.append(dataclasses.replace(o, rows=rows, roots=weight * o.roots, board=board))
+        frame_of.append(at)
+    poses = first.rigs_from_board
+    estimate = RigEstimate(
+        tuple(one.camera for one in alone), first.cams_from_rig.rotation.matrix,
+        np.array(first.cams_from_rig.translation), poses.rotation.matrix, np.array(poses.translation),
+        shape_of(config.alone("opencv5"), board, alone),
+    )  # fmt: skip
+    return RigObservations(frames, tuple(cameras), tuple(frame_of)), estimate
+
+
+def _shared_frames(observations: RigObservations, estimate: RigEstimate) -> tuple[RigObservations, RigEstimate]:
+    """What only one camera saw says nothing of the rig if cameras and board are held."""
+    shared = np.flatnonzero(observations.views_per_frame > 1)
+    some, left = observations.of_frames(shared.tolist())
+    return some, estimate.of_frames(left)
+
+
+def _unconnected(
+    names: tuple[str, ...], observations: RigObservations, needed: int, rejected: Sequence[Sequence[RejectedView]]
+) -> Rejected | None:
+    """Rejection may have left a camera without connection."""
+    sets = [set(frames.tolist()) for frames in observations.frame_of]
+    edges = [(i, j) for i in range(len(sets)) for j in range(i) if len(sets[i] & sets[j]) >= needed]
+    groups = connected_components(len(names), np.array(edges, np.int64).reshape(-1, 2))
+    if len(groups) == 1:
+        return None
+    told = " | ".join(", ".join(names[c] for c in group.tolist()) for group in groups)
+    lost = sum(view.reason == "disagrees" for one in rejected for view in one)
+    return Rejected(
+        "cameras_disagree",
+        f"{told}: {lost} views do not fit a rigid mount; are frames paired rightly, and taken at one moment?",
+    )
+
+
+def _result(
+    names: tuple[str, ...], alone: Sequence[AloneCamera], fit: RigFit, system: RigSystem, summary: Summary,
+    first: FirstPoses, turns: Sequence[BoardTurn], frames: tuple[str, ...],
+    views: Sequence[Sequence[RejectedView]], corners: Sequence[Sequence[tuple[str, int]]],
+) -> RigCalibration:  # fmt: skip
+    observations, residuals, estimate = system.observations, system.residuals(), system.estimate
+    unknown = 6 * len(observations.frames) + system.shared_count
+    freedom = 2 * observations.corner_count - unknown
+    total = sum(float(np.sum(r**2)) for r in residuals)
+    return RigCalibration(
+        names=names,
+        cameras=estimate.cameras,
+        cams_from_rig=estimate.cams_from_rig,
+        rigs_from_board=estimate.rigs_from_board,
+        shape=estimate.shape,
+        free_names=tuple(
+            tuple(camera.model_info.param_names[k] for k in columns)
+            for camera, columns in zip(estimate.cameras, fit.columns, strict=True)
+        ),
+        observations=observations,
+        residuals=tuple(residuals),
+        alone=tuple(alone),
+        turned=tuple(tuple(frames[f] for f in np.flatnonzero(chosen)) for chosen in first.turns),
+        rejected_views=tuple(tuple(one) for one in views),
+        rejected_corners=tuple(tuple(one) for one in corners),
+        rms_px=math.sqrt(total / observations.corner_count),
+        sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
+        fallbacks=_fallbacks(names, alone, first),
+        converged=system.newton_decrement() <= _CONVERGED * summary.final_cost + _EXACT * observations.corner_count,
+        iterations=len(summary.iterations) - 1,
+        cost=summary.final_cost,
+    )
+
+
+def _fallbacks(names: tuple[str, ...], alone: Sequence[AloneCamera], first: FirstPoses) -> tuple[str, ...]:
+    doubts = [
+        f"{names[i]} and {names[j]}: the views do not tell which end of the board is which; the smaller turn between "
+        "the cameras was taken"
+        for i, j in first.doubtful
+    ]
+    return (*doubts, *(words for one in alone for words in one.fallbacks))

@@ -1,0 +1,143 @@
+"""What is left out of a rig: corners that do not fit, and views that disagree with the others of their frame."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.refine_fit import ROBUST
+from calib.refine_reject import RejectedView
+from calib.rig_system import RigEstimate, RigSystem
+from calib.rig_views import RigObservations
+from sfm.core.arrays import FloatArray, Value, Vector
+from sfm.core.errors import Rejected
+from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
+from sfm.core.optim.losses import Loss
+
+_RAYLEIGH_MEDIAN = 1.17741
+"""Median length of a pair of unit normal numbers."""
+_NEAR = 1e-6
+"""Damping near the minimum over the usual one."""
+_ROUNDS = 8
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigFit(Value):
+    """One way to fit: what does not change between the attempts.
+
+    Attributes:
+        columns: of each camera the positions of its free parameters.
+    """
+
+    keep_invertible: bool
+    max_iterations: int
+    relative_cost_tolerance: float
+    reject_beyond_sigma: float
+    keep_within_sigma: float
+    min_corners: int
+    columns: tuple[np.ndarray, ...]
+
+    def system(
+        self, observations: RigObservations, estimate: RigEstimate, loss: Loss = "trivial", scale: float = 1.0
+    ) -> RigSystem:
+        """The problem from here."""
+        return RigSystem(
+            observations,
+            estimate,
+            self.columns,
+            free_shape=len(estimate.shape.coefficients) > 0,
+            loss=loss,
+            loss_scale=scale,
+            keep_invertible=self.keep_invertible,
+            caution=_NEAR if loss == "trivial" else 1.0,
+        )
+
+    def solve(self, observations: RigObservations, estimate: RigEstimate) -> tuple[RigSystem, Summary]:
+        """Least squares, to the end."""
+        system = self.system(observations, estimate)
+        rules = StopRules(
+            max_iterations=self.max_iterations,
+            relative_cost_tolerance=self.relative_cost_tolerance,
+            gradient_tolerance=0.0,
+        )
+        return system, minimize(system, rules)
+
+
+def reject_from_rig(
+    fit: RigFit, system: RigSystem, summary: Summary, views: Sequence[list[RejectedView]],
+    corners: Sequence[list[tuple[str, int]]],
+) -> tuple[RigSystem, Summary] | Rejected:  # fmt: skip
+    """Refits without corners beyond some σ, and without views that lose half of theirs; appends them, by camera.
+
+    Corners may come back: all are judged again by each new fit, until the choice stays.
+
+    Returns:
+        `nothing_fits` where no two views of a frame are left.
+    """
+    lengths = _lengths(system)
+    if not np.concatenate(lengths).max() > fit.reject_beyond_sigma * _spread_of(np.concatenate(lengths)):
+        return system, summary
+    full = system.observations
+    # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
+    judge = fit.system(full, system.estimate, "cauchy", 2 * _spread_of(np.concatenate(lengths)))
+    minimize(judge, ROBUST)
+    before: list[np.ndarray] | None = None
+    for _ in range(_ROUNDS):
+        lengths = _lengths(judge)
+        inliers = np.concatenate(lengths)
+        sigma = _spread_of(inliers if before is None else inliers[np.concatenate(before)])
+        kept = [one <= fit.keep_within_sigma * sigma for one in lengths]
+        good = [_good_views(full, c, kept[c], lengths[c], sigma, fit.min_corners, views[c]) for c in range(len(kept))]
+        changed = any(len(good[c]) < len(full.cameras[c]) for c in range(len(good)))
+        if not changed and before is not None and all(np.array_equal(a, b) for a, b in zip(kept, before, strict=True)):
+            break
+        if not all(good):
+            return Rejected("nothing_fits", "a camera has no view left that agrees with the others")
+        kept = [_of_views(full, c, kept[c], good[c]) for c in range(len(kept))]
+        full, left = full.of_views(good)
+        system, summary = fit.solve(full.of_corners(kept), judge.estimate.of_frames(left))
+        judge, before = fit.system(full, system.estimate), kept
+    for c, mask in enumerate(before or []):
+        names, view_of = full.cameras[c].names, full.cameras[c].view_of
+        corners[c].extend((names[view_of[n]], int(full.cameras[c].rows[n])) for n in np.flatnonzero(~mask))
+    return system, summary
+
+
+def _of_views(observations: RigObservations, camera: int, mask: np.ndarray, kept: Sequence[int]) -> np.ndarray:
+    """The part of a mask of corners that belongs to these views."""
+    offsets = observations.cameras[camera].offsets
+    return np.concatenate([np.zeros(0, bool), *(mask[offsets[v] : offsets[v + 1]] for v in kept)])
+
+
+def _good_views(
+    observations: RigObservations, camera: int, kept: np.ndarray, lengths: Vector, sigma: float, min_corners: int,
+    rejected: list[RejectedView],
+) -> list[int]:  # fmt: skip
+    """Views of one camera to go on with; appends the others, whose corners are mostly outliers."""
+    seen, good = observations.cameras[camera], []
+    for v, name in enumerate(seen.names):
+        inside = kept[seen.offsets[v] : seen.offsets[v + 1]]
+        if inside.sum() >= max(min_corners, 0.5 * len(inside)):
+            good.append(v)
+            continue
+        typical = float(np.median(lengths[seen.offsets[v] : seen.offsets[v + 1]]))
+        detail = f"{int((~inside).sum())} of {len(inside)} corners beyond limits; median {typical / sigma:.1f} sigma"
+        rejected.append(RejectedView(name, "disagrees", detail))
+    return good
+
+
+def _lengths(system: RigSystem) -> list[FloatArray]:
+    """Of each camera (n,) lengths of the whitened residuals; inf where there is no projection."""
+    found = []
+    for r, camera in zip(system.residuals(), system.observations.cameras, strict=True):
+        a, b, c = camera.roots.T
+        lengths = np.hypot(a * r[:, 0] + b * r[:, 1], c * r[:, 1])
+        found.append(np.where(np.isfinite(lengths), lengths, np.inf))
+    return found
+
+
+def _spread_of(lengths: Vector) -> float:
+    """The standard deviation of a coordinate by the median length."""
+    return max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)

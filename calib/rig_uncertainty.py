@@ -1,0 +1,226 @@
+"""How uncertain a calibrated rig is, and what it says of frames that it has not seen.
+
+With unit noise the covariance of what frames share is S⁻¹ (see `rig_system`), times the variance of the residuals. It
+takes residuals for independent; `by_frame` takes only the frames for independent, by leaving out each in turn with one
+Newton step, as `uncertainty` does with views.
+
+The tangent of the pose of camera 2 relative to camera 1, T = T_2 T_1⁻¹, is  δ_2 − Ad(T) δ_1.  With T = (R, t) and
+δ = (ω, υ) its translation moves by ω × t + υ, and the baseline |t| by υ · t / |t|.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+from jaxtyping import Float64
+
+from calib.rig import RigCalibration
+from calib.rig_system import RigSystem
+from sfm.core.arrays import FloatArray, Value, Vector, readonly
+from sfm.core.errors import Rejected
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import skew
+from sfm.core.optim.levenberg_marquardt import StopRules, minimize
+
+_POSES = StopRules(max_iterations=50, relative_cost_tolerance=1e-10, gradient_tolerance=0.0)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigCovariance(Value):
+    """Covariances of what was estimated.
+
+    Attributes:
+        shared: (K, K) of mounts, then free parameters of one camera after the other, then the board's coefficients.
+        mounts: (N, 6, 6) of the tangents (ω, υ) of `cams_from_rig`; zero for the first.
+        sigma_params: of each camera by the names of its free parameters.
+        variance: σ² of one whitened coordinate, px², already in all of them.
+    """
+
+    shared: Float64[np.ndarray, "K K"]
+    mounts: Float64[np.ndarray, "N 6 6"]
+    sigma_params: tuple[dict[str, float], ...]
+    variance: float
+    mount_slices: tuple[slice, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shared", readonly(self.shared, (None, None)))
+        object.__setattr__(self, "mounts", readonly(self.mounts, (None, 6, 6)))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RelativeUncertainty(Value):
+    """How well the pose of one camera relative to another is known.
+
+    Attributes:
+        covariance: (6, 6) of the tangent (ω, υ), radians and the board's unit.
+        baseline, sigma_baseline: distance of the cameras, in the board's unit.
+        sigma_rotation: (3,) of turns about the axes of camera 2, radians.
+        sigma_translation: (3,) of the translation.
+    """
+
+    cam2_from_cam1: Rigid3
+    covariance: Float64[np.ndarray, "6 6"]
+    baseline: float
+    sigma_baseline: float
+    sigma_rotation: Float64[np.ndarray, " 3"]
+    sigma_translation: Float64[np.ndarray, " 3"]
+
+
+def rig_covariance(found: RigCalibration, *, by_frame: bool = False) -> RigCovariance | Rejected:
+    """Covariances at the solution.
+
+    Args:
+        by_frame: by leaving out each frame in turn, which holds however residuals of one frame are correlated; it needs
+            many more frames than shared parameters to be accurate itself.
+    Returns:
+        `undetermined_parameters` where the frames leave a combination of them open.
+    """
+    system = found.system()
+    unit = system.shared_inverse()
+    if unit is None:
+        return Rejected("undetermined_parameters", "the frames leave a combination of parameters open")
+    variance = found.sigma_px**2
+    shared = _jackknife(found, system) if by_frame else variance * unit
+    if shared is None:
+        return Rejected("undetermined_parameters", "without one of the frames a combination of parameters is open")
+    mounts = np.zeros((len(found.names), 6, 6))
+    for c, at in enumerate(system.mount_slices):
+        if at.stop > at.start:
+            mounts[c] = shared[at, at]
+    deviations = np.sqrt(np.diag(shared))
+    return RigCovariance(
+        shared=shared,
+        mounts=mounts,
+        sigma_params=tuple(
+            dict(zip(names, deviations[at].tolist(), strict=True))
+            for names, at in zip(found.free_names, system.param_slices, strict=True)
+        ),
+        variance=variance,
+        mount_slices=tuple(system.mount_slices),
+    )
+
+
+def relative_uncertainty(
+    found: RigCalibration, covariances: RigCovariance, camera1: int, camera2: int
+) -> RelativeUncertainty:
+    """Of two cameras by their positions in the rig."""
+    motion = found.cams_from_rig[camera2] @ found.cams_from_rig[camera1].inverse()
+    J = np.zeros((6, len(covariances.shared)))
+    # The mount of the first camera is held: its slice is empty.
+    one, two = covariances.mount_slices[camera1], covariances.mount_slices[camera2]
+    J[:, one] = -motion.adjoint()[:, : one.stop - one.start]
+    J[:, two] += np.eye(6)[:, : two.stop - two.start]
+    covariance = J @ covariances.shared @ J.T
+    t = np.array(motion.translation)
+    baseline = float(np.linalg.norm(t))
+    along = t / max(baseline, 1e-300)
+    by_tangent = np.concatenate([-skew(t), np.eye(3)], axis=1)
+    return RelativeUncertainty(
+        cam2_from_cam1=motion,
+        covariance=covariance,
+        baseline=baseline,
+        sigma_baseline=math.sqrt(max(float(along @ covariance[3:, 3:] @ along), 0.0)),
+        sigma_rotation=np.sqrt(np.maximum(np.diag(covariance)[:3], 0.0)),
+        sigma_translation=np.sqrt(np.maximum(np.diag(by_tangent @ covariance @ by_tangent.T), 0.0)),
+    )
+
+
+def _jackknife(found: RigCalibration, system: RigSystem) -> FloatArray | None:
+    """(F − 1)/F Σ (θ₋f − mean)(…)ᵀ."""
+    parts = [_part_of(found, system, f) for f in range(len(found.observations.frames))]
+    S, steps = np.sum([part for part, _ in parts], axis=0), []
+    for part, score in parts:
+        inverse = _inverse(S - part)
+        if inverse is None:
+            return None
+        steps.append(inverse @ score)
+    apart = np.array(steps) - np.mean(steps, axis=0)
+    return (len(steps) - 1) / len(steps) * apart.T @ apart
+
+
+def _part_of(found: RigCalibration, system: RigSystem, frame: int) -> tuple[FloatArray, Vector]:
+    """What one frame adds to S and to the gradient, with its pose eliminated."""
+    some, left = found.observations.of_frames([frame])
+    free_shape = len(found.shape.coefficients) > 0
+    alone = RigSystem(some, system.estimate.of_frames(left), found.columns, free_shape=free_shape).normal_equations()
+    H, W = alone.H[0], alone.W[0]
+    reduced = alone.A - W.T @ np.linalg.solve(H, W)
+    return reduced[:-1, :-1], reduced[:-1, -1]
+
+
+def _inverse(S: FloatArray) -> FloatArray | None:
+    """The inverse of a matrix of any scale, None where it is singular."""
+    root = np.sqrt(np.diag(S))
+    if not np.all(root > 0):
+        return None
+    values, vectors = np.linalg.eigh(S / np.outer(root, root))
+    if not values[0] > 1e-15 * values[-1]:
+        return None
+    return (vectors / values) @ vectors.T / np.outer(root, root)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigHeldOut(Value):
+    """Errors of frames that were held out.
+
+    Attributes:
+        frames: those that two cameras or more saw.
+        rms_px: root of the mean squared length of their residuals, with the rig of the other frames and their own
+            poses.
+        training_rms_px: of the same frames in fits that knew them.
+    """
+
+    frames: tuple[str, ...]
+    rms_px: float
+    training_rms_px: float
+
+
+def hold_out_frames(
+    found: RigCalibration, *, folds: int = 5, rng: np.random.Generator
+) -> RigHeldOut | Rejected:  # fmt: skip
+    """Errors of the frames of a rig, each held out once, at the corners that it kept.
+
+    Returns:
+        `too_few_frames` where the others do not determine the rig.
+    """
+    observations, estimate = found.observations, found.estimate
+    shared = np.flatnonzero(observations.views_per_frame > 1)
+    folds = min(folds, len(shared))
+    if folds < 2:
+        return Rejected("too_few_frames", f"{len(shared)} frames seen by two cameras")
+    order, fit = rng.permutation(shared), found.fit
+    squares = count = 0.0
+    for fold in range(folds):
+        held = np.sort(order[fold::folds])
+        rest = np.setdiff1d(np.arange(len(observations.frames)), held)
+        some, left = observations.of_frames(rest.tolist())
+        system, _ = fit.solve(some, estimate.of_frames(left))
+        if not math.isfinite(system.newton_decrement()):
+            return Rejected("too_few_frames", f"without {len(held)} of {len(shared)} frames a camera is lost")
+        rig = system.estimate
+        there, left = observations.of_frames(held.tolist())
+        placed = dataclasses.replace(
+            estimate.of_frames(left), cameras=rig.cameras, mount_rotations=rig.mount_rotations,
+            mount_translations=rig.mount_translations, shape=rig.shape,
+        )  # fmt: skip
+        none = [np.zeros(0, np.int64)] * len(rig.cameras)
+        judge = RigSystem(there, placed, none, free_mounts=False)
+        minimize(judge, _POSES)
+        squares += sum(float(np.sum(r**2)) for r in judge.residuals())
+        count += there.corner_count
+    return RigHeldOut(
+        frames=tuple(observations.frames[f] for f in shared),
+        rms_px=math.sqrt(squares / count),
+        training_rms_px=_training_rms(found, shared),
+    )
+
+
+def _training_rms(found: RigCalibration, shared: np.ndarray) -> float:
+    squares = count = 0.0
+    for r, camera, frames in zip(found.residuals, found.observations.cameras, found.observations.frame_of, strict=True):
+        inside = np.isin(frames, shared)[camera.view_of]
+        squares += float(np.sum(r[inside] ** 2))
+        count += float(inside.sum())
+    return math.sqrt(squares / count)
