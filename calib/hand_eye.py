@@ -185,7 +185,8 @@ def _prepared(
         told = "; ".join(f"{view.name}: {view.reason}" for view in alone.rejected[:5])
         detail = f"{len(mounts)} of {config.min_poses} needed"
         return Rejected("too_few_poses", detail + (f" ({told})" if told else ""))
-    if short := turned_enough(mounts.rotation):
+    short = turned_enough(mounts.rotation)
+    if short is not None:
         return short
     turns = turns or tuple(turn for turn in [turn_of(board, 0)] if turn is not None)
     chosen = consistent_turns(mounts, alone.cams_from_board, turns)
@@ -193,7 +194,8 @@ def _prepared(
     rows = np.stack([turn.rows for turn in turns])[chosen[o.view_of], o.rows]
     back = Rigid3.stack([turns[k].motion.inverse() for k in chosen.tolist()])
     poses = alone.cams_from_board @ back
-    if other := motions_agree(mounts, poses):
+    other = motions_agree(mounts, poses)
+    if other is not None:
         return other
     observations = dataclasses.replace(o, rows=rows, board=board)
     named = tuple(o.names[v] for v in np.flatnonzero(chosen))
@@ -205,7 +207,8 @@ def _solved(problem: _Problem, alone: AloneCamera, config: HandEyeConfig) -> Han
     rejected = list(alone.rejected)
     while True:
         X, Z = closed_form(problem.mounts, problem.cams_from_board)
-        if other := same_unit(problem.mounts, problem.cams_from_board, X):
+        other = same_unit(problem.mounts, problem.cams_from_board, X)
+        if other is not None:
             return other
         information = _information(problem)
         X, Z, sigma = _balanced(problem, information, X, Z, config.robot_sigma)
@@ -215,7 +218,8 @@ def _solved(problem: _Problem, alone: AloneCamera, config: HandEyeConfig) -> Han
         detail = f"the robot's pose is off by {off:.0f} standard deviations of the others"
         rejected.append(RejectedView(problem.observations.names[worst], "disagrees", detail))
         problem = problem.of_views([v for v in range(problem.many) if v != worst])
-        if short := turned_enough(problem.mounts.rotation):
+        short = turned_enough(problem.mounts.rotation)
+        if short is not None:
             return short
     system, summary = _refined(problem, X, Z, sigma, config)
     unit = system.shared_inverse()

@@ -34,6 +34,8 @@ from sfm.core.optim.levenberg_marquardt import Summary
 
 __all__ = ["RigCalibration", "RigConfig", "calibrate_rig"]
 
+_MISFIT = 1.5
+"""Noise of the rig over that of its cameras alone that is worth a word."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
 
@@ -146,7 +148,7 @@ class RigCalibration(Value):
     @property
     def fit(self) -> RigFit:
         """To fit again, with other views."""
-        return RigFit(True, 500, 1e-12, math.inf, math.inf, 0, tuple(self.columns))
+        return RigFit(True, 500, 1e-12, math.inf, math.inf, 0, math.inf, tuple(self.columns))
 
     @property
     def calibrations(self) -> tuple[Calibration | None, ...]:
@@ -177,7 +179,8 @@ def calibrate_rig(
     names = tuple(one.name for one in cameras)
     if len(names) < 2 or len(set(names)) < len(names):
         raise ValueError(f"expected two or more cameras of different names, got {', '.join(names)}")
-    if copied := _same_photos(cameras):
+    copied = _same_photos(cameras)
+    if copied is not None:
         return copied
     alone = []
     for one in cameras:
@@ -205,7 +208,7 @@ def calibrate_rig(
             return rejected
         system, summary = rejected
     apart = _unconnected(names, system.observations, config.min_frames, views)
-    if apart:
+    if apart is not None:
         return apart
     return _result(names, alone, fit, system, summary, first, turns, frames, views, corners)
 
@@ -214,9 +217,14 @@ def _fit(config: RigConfig, alone: Sequence[AloneCamera]) -> RigFit:
     held = np.zeros(0, np.int64)
     return RigFit(
         config.keep_invertible, config.max_iterations, config.relative_cost_tolerance, config.reject_beyond_sigma,
-        config.keep_within_sigma, config.min_corners,
+        config.keep_within_sigma, config.min_corners, _typical_sigma(alone),
         tuple(one.columns if config.refine_intrinsics or one.calibration is None else held for one in alone),
     )  # fmt: skip
+
+
+def _typical_sigma(alone: Sequence[AloneCamera]) -> float:
+    """Of the corners of cameras alone, in whose units residuals are whitened."""
+    return float(np.median([one.sigma_px for one in alone]))
 
 
 def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
@@ -255,7 +263,7 @@ def _gathered(
     turns: Sequence[BoardTurn], config: RigConfig,
 ) -> tuple[RigObservations, RigEstimate]:  # fmt: skip
     """All views, read from the same side and weighted, with where everything is at first."""
-    typical = float(np.median([one.sigma_px for one in alone]))
+    typical = _typical_sigma(alone)
     cameras, frame_of = [], []
     for c, one in enumerate(alone):
         o = one.observations
@@ -306,6 +314,7 @@ def _result(
     unknown = 6 * len(observations.frames) + system.shared_count
     freedom = 2 * observations.corner_count - unknown
     total = sum(float(np.sum(r**2)) for r in residuals)
+    sigma = math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan
     return RigCalibration(
         names=names,
         cameras=estimate.cameras,
@@ -323,18 +332,26 @@ def _result(
         rejected_views=tuple(tuple(one) for one in views),
         rejected_corners=tuple(tuple(one) for one in corners),
         rms_px=math.sqrt(total / observations.corner_count),
-        sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
-        fallbacks=_fallbacks(names, alone, first),
+        sigma_px=sigma,
+        fallbacks=_fallbacks(names, alone, first, sigma),
         converged=system.newton_decrement() <= _CONVERGED * summary.final_cost + _EXACT * observations.corner_count,
         iterations=len(summary.iterations) - 1,
         cost=summary.final_cost,
     )
 
 
-def _fallbacks(names: tuple[str, ...], alone: Sequence[AloneCamera], first: FirstPoses) -> tuple[str, ...]:
+def _fallbacks(
+    names: tuple[str, ...], alone: Sequence[AloneCamera], first: FirstPoses, sigma_px: float
+) -> tuple[str, ...]:
     doubts = [
         f"{names[i]} and {names[j]}: the views do not tell which end of the board is which; the smaller turn between "
         "the cameras was taken"
         for i, j in first.doubtful
     ]
+    typical = _typical_sigma(alone)
+    if sigma_px > _MISFIT * typical:
+        doubts.append(
+            f"together corners are off by {sigma_px:.2f} px, alone by {typical:.2f} px: the cameras moved against each "
+            "other, or photos of one frame were not taken at one moment"
+        )
     return (*doubts, *(words for one in alone for words in one.fallbacks))

@@ -82,16 +82,30 @@ def _alone(table: FrameTable) -> int:
 def _paired(photos: Mapping[str, Sequence[str]], by: Literal["stem", "number", "order"]) -> FrameTable | Rejected:
     if by == "order":
         return _in_order(photos)
+    keys = {camera: [_stem(name) for name in names] for camera, names in photos.items()}
+    if by == "number":
+        keys = _written({camera: _numbers(names) for camera, names in photos.items()}, keys)
     frames = {}
     for camera, names in photos.items():
-        keys = [_stem(name) for name in names] if by == "stem" else _numbers(names)
         first: dict[str, str] = {}
-        for name, key in zip(names, keys, strict=True):
+        for name, key in zip(names, keys[camera], strict=True):
             if key in first:
                 return Rejected("two_photos_of_a_frame", f"{camera}: {first[key]} and {name} are both frame {key}")
             first[key] = name
-        frames[camera] = dict(zip(names, keys, strict=True))
+        frames[camera] = dict(zip(names, keys[camera], strict=True))
     return FrameTable(by, frames)
+
+
+def _written(numbers: Mapping[str, list[tuple[int, ...]]], stems: Mapping[str, list[str]]) -> dict[str, list[str]]:
+    """Numbers as text that sorts as they do; a name without a number stays as it is."""
+    width = max((len(str(number)) for one in numbers.values() for some in one for number in some), default=1)
+    return {
+        camera: [
+            "-".join(f"{number:0{width}d}" for number in some) or stem
+            for some, stem in zip(one, stems[camera], strict=True)
+        ]
+        for camera, one in numbers.items()
+    }
 
 
 def _in_order(photos: Mapping[str, Sequence[str]]) -> FrameTable | Rejected:
@@ -109,12 +123,12 @@ def _stem(name: str) -> str:
     return str(PurePath(name).with_suffix(""))
 
 
-def _numbers(names: Sequence[str]) -> list[str]:
-    """Of each name the numbers that change within a camera, else its last; a name without one stays as it is."""
-    found = [[int(digits) for digits in _DIGITS.findall(_stem(name))] for name in names]
+def _numbers(names: Sequence[str]) -> list[tuple[int, ...]]:
+    """Of each name the numbers that change within a camera, else its last; none of a name without one."""
+    found = [tuple(int(digits) for digits in _DIGITS.findall(_stem(name))) for name in names]
     counts = {len(numbers) for numbers in found}
     if len(counts) == 1 and len(names) > 1 and 0 not in counts:
         changing = [k for k in range(counts.pop()) if len({numbers[k] for numbers in found}) > 1]
         if changing:
-            return ["-".join(f"{numbers[k]:06d}" for k in changing) for numbers in found]
-    return [f"{numbers[-1]:06d}" if numbers else _stem(name) for name, numbers in zip(names, found, strict=True)]
+            return [tuple(numbers[k] for k in changing) for numbers in found]
+    return [numbers[-1:] for numbers in found]

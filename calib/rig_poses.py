@@ -192,7 +192,7 @@ class FirstPoses(Value):
 
     cams_from_rig: Rigid3
     rigs_from_board: Rigid3
-    turns: Int64[np.ndarray, "N F"]
+    turns: Int64[np.ndarray, "C F"]
     tree: tuple[Connection, ...]
     doubtful: tuple[tuple[int, int], ...]
 
@@ -268,7 +268,7 @@ def _along(tree: Sequence[Connection], relative: Sequence[FloatArray], count: in
 
 def _frames(
     mounts: FloatArray, seen: Sequence[CameraFrames], turns: Sequence[BoardTurn], probes: Points3D
-) -> tuple[FloatArray, Int64[np.ndarray, "N F"]]:
+) -> tuple[FloatArray, Int64[np.ndarray, "C F"]]:
     """Of each frame the pose on which its views agree best (F, 4, 4), and the turns by which they do.
 
     The camera with the most corners reads the board as it did.

@@ -20,6 +20,8 @@ _RAYLEIGH_MEDIAN = 1.17741
 """Median length of a pair of unit normal numbers."""
 _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
+_WORSE = 3.0
+"""Noise of the rig over that of its cameras alone that is put down to the model; more is put down to single views."""
 _ROUNDS = 8
 
 
@@ -28,6 +30,8 @@ class RigFit(Value):
     """One way to fit: what does not change between the attempts.
 
     Attributes:
+        alone_sigma: standard deviation of a whitened coordinate in cameras alone. If views of a frame do not belong
+            together, residuals are large throughout, and no measure of what is usual.
         columns: of each camera the positions of its free parameters.
     """
 
@@ -37,6 +41,7 @@ class RigFit(Value):
     reject_beyond_sigma: float
     keep_within_sigma: float
     min_corners: int
+    alone_sigma: float
     columns: tuple[np.ndarray, ...]
 
     def system(
@@ -76,18 +81,20 @@ def reject_from_rig(
     Returns:
         `nothing_fits` where no two views of a frame are left.
     """
-    lengths = _lengths(system)
-    if not np.concatenate(lengths).max() > fit.reject_beyond_sigma * _spread_of(np.concatenate(lengths)):
+    lengths = np.concatenate(_lengths(system))
+    sigma = min(_spread_of(lengths), _WORSE * fit.alone_sigma)
+    if not lengths.max() > fit.reject_beyond_sigma * sigma:
         return system, summary
     full = system.observations
     # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
-    judge = fit.system(full, system.estimate, "cauchy", 2 * _spread_of(np.concatenate(lengths)))
+    judge = fit.system(full, system.estimate, "cauchy", 2 * sigma)
     minimize(judge, ROBUST)
     before: list[np.ndarray] | None = None
     for _ in range(_ROUNDS):
         lengths = _lengths(judge)
         inliers = np.concatenate(lengths)
         sigma = _spread_of(inliers if before is None else inliers[np.concatenate(before)])
+        sigma = min(sigma, _WORSE * fit.alone_sigma)
         kept = [one <= fit.keep_within_sigma * sigma for one in lengths]
         good = [_good_views(full, c, kept[c], lengths[c], sigma, fit.min_corners, views[c]) for c in range(len(kept))]
         changed = any(len(good[c]) < len(full.cameras[c]) for c in range(len(good)))

@@ -16,6 +16,10 @@ COMMANDS = {
     "detect": "the corners of a board in photos, and what they look like",
     "camera": "photos of a board → a camera, and how far to trust it",
     "check": "whether other photos agree with a camera, and which would help most",
+    "stereo": "two cameras that are mounted together, and how they stand",
+    "rig": "several such cameras, of any models",
+    "handeye": "where a camera sits on a robot, from photos and the robot's poses",
+    "convert": "a calibration in another program's file: OpenCV, ROS, Kalibr, COLMAP, nerfstudio",
 }
 """In the order in which they are used; `calib.cli.<name>` holds each."""
 
@@ -24,6 +28,7 @@ Examples:
   calib board chessboard --cols 9 --rows 6 --square 25mm -o board.pdf
   calib camera photos --board board.toml -o camera.toml
   calib check camera.toml more_photos
+  calib stereo left right --board board.toml -o rig.toml
   calib board --help               # the options of a command, with examples"""
 
 

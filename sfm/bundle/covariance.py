@@ -56,7 +56,7 @@ class BundleCovariance(Value):
         poses: (I, 6, 6) of the tangent (ω, υ) of `cams_from_world`, radians and scene units, update on the left; zero
             where a pose is constant or held, NaN where no observation sees it.
         centers: (I, 3, 3) of the camera centres in the world.
-        params: (C, 12, 12) of the camera parameters; zero where they are constant or on a bound, which holds them.
+        params: (C, K, K) of the camera parameters; zero where they are constant or on a bound, which holds them.
         points3D: (P, 3, 3); zero where a point is constant, NaN where its views do not determine it.
         variance_factor: twice the cost over the degrees of freedom. Where the stated standard deviations are only
             proportional to the true ones, all covariances times this are right; see `scaled`.

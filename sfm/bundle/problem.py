@@ -27,19 +27,19 @@ class BundleProblem(Value):
 
     Attributes:
         model_ids: (C,) numbers of the camera models.
-        camera_params: (C, 12) parameters in the order of the model, padded with zeros.
+        camera_params: (C, K) parameters in the order of the model, padded with zeros; K = MAX_PARAMS holds any.
         image_cameras: (I,) the row of the camera of each image.
         cams_from_world: batch (I,), in scene units.
         points3D: (P, 3) in the world.
         obs_images, obs_points: (n,) the image row and the point row of each observation, in any order.
         obs_points2D: (n, 2) px.
-        free_params: (C, 12) which camera parameters may change; padding must be False.
+        free_params: (C, K) which camera parameters may change; padding must be False.
         free_poses, free_points: (I,) and (P,).
         obs_sigmas: (n,) standard deviations by which residuals are divided: in px, or up to a common factor; None is 1
             for all.
-        lower_params, upper_params: (C, 12) what free camera parameters may be at least and at most; −inf and inf bound
+        lower_params, upper_params: (C, K) what free camera parameters may be at least and at most; −inf and inf bound
             nothing, and so does None for all.
-        prior_params, prior_sigmas: (C, 12) what free camera parameters are expected to be, and the standard deviation
+        prior_params, prior_sigmas: (C, K) what free camera parameters are expected to be, and the standard deviation
             of that; inf expects nothing, and so does None for all.
         rigs: where images were taken together; `cams_from_world` must be that of the rigs then, and a rig moves where
             all of its images may. None lets every image move by itself.

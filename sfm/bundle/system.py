@@ -108,7 +108,7 @@ class BundleSystem:
 
     @property
     def camera_params(self) -> FloatArray:
-        """Current camera parameters (C, 12)."""
+        """Current camera parameters (C, K)."""
         return self._state.params
 
     @property

@@ -26,6 +26,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -140,7 +141,7 @@ def write_rig_file(path: Path | str, file: RigFile) -> None:
     lines += [f"rms_px = {file.rms_px!r}"] if math.isfinite(file.rms_px) else []
     if file.provenance:
         lines += ["", "[rig.provenance]"]
-        lines += [f"{_quoted(name)} = {_written(fact)}" for name, fact in file.provenance.items()]
+        lines += [f"{_key(name)} = {_written(fact)}" for name, fact in file.provenance.items()]
     for k, (name, camera) in enumerate(zip(rig.names, rig.cameras, strict=True)):
         pose = rig.cams_from_rig[k]
         lines += [
@@ -214,6 +215,10 @@ def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str, path: Pa
     unknown = sorted(set(table) - set(keys))
     if unknown:
         raise ConfigError(f"{where}unknown key {unknown[0]!r}; known are {', '.join(keys)}", path=path)
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
 
 
 def _quoted(text: str) -> str:

@@ -7,6 +7,7 @@ import pytest
 
 from sfm.bundle import BundleConfig, BundleCovariance, adjust, covariance, squared_errors
 from sfm.bundle.problem import SolverChoice
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.events import BundleAdjusted, BundlePlanned
 from sfm.core.geometry.rigid import Rigid3
 
@@ -175,7 +176,7 @@ def test_one_kind_alone_can_be_adjusted(make_problem, perturbed, rng, which):
         truth,
         free_points=np.full(len(truth.points3D), which == "points"),
         free_poses=np.full(len(truth.free_poses), which == "poses"),
-        free_params=np.isin(np.arange(12), (0, 3))[None] & (which == "params"),
+        free_params=np.isin(np.arange(MAX_PARAMS), (0, 3))[None] & (which == "params"),
     )
     result = adjust(perturbed(only, rng), TIGHT)
     assert result.final_cost < 1e-12

@@ -14,6 +14,7 @@ from sfm.bundle.layout import lay_out
 from sfm.bundle.prior_terms import prior_residuals
 from sfm.bundle.priors import DistancePrior, GravityPrior, PositionPrior
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -35,7 +36,7 @@ def build_rig(rng, noise_px=0.3, points=60, free_sensors=False, free_params=()):
     poses, points3D = rigs.cams_from_world, rng.uniform(-1.5, 1.5, (points, 3))
     rows = np.argwhere(rng.random((points, len(poses))) < 0.7)
     points2D, valid = camera.project(poses[rows[:, 1]] @ points3D[rows[:, 0]])
-    params, free = np.zeros((1, 12)), np.zeros((1, 12), bool)
+    params, free = np.zeros((1, MAX_PARAMS)), np.zeros((1, MAX_PARAMS), bool)
     params[0, :4], free[0, list(free_params)] = camera.params, True
     return BundleProblem(
         model_ids=np.array([camera.model_info.model_id], np.int32),
