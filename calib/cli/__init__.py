@@ -14,6 +14,7 @@ from sfm.core.errors import ExitCode, SfmError
 COMMANDS = {
     "board": "a board to print: PDF or SVG at true scale",
     "detect": "the corners of a board in photos, and what they look like",
+    "undistort": "photos as a lens without distortion would have taken them",
     "convert": "a calibration in another program's file: OpenCV, ROS, Kalibr, COLMAP, nerfstudio",
 }
 """In the order in which they are used; `calib.cli.<name>` holds each."""
