@@ -46,8 +46,8 @@ class UndistortOptions:
     """The camera to make."""
 
     crop: Literal["inside", "full", "valid"] = "inside"
-    """inside: zoomed in until no pixel is blank; full: zoomed out until nothing is lost; valid: the scale of the middle
-    is kept, and blank borders are cut off."""
+    """inside: as much as can be shown without a blank pixel; full: all of the photo, with blank borders; valid: the
+    scale of the middle is kept, and blank borders are cut off."""
 
     focal: Annotated[float, tyro.conf.arg(metavar="PX", help_behavior_hint="")] = 0.0
     """The focal length, px of the photo, instead of the one that --crop chooses."""
@@ -202,5 +202,5 @@ def _encoded(image: np.ndarray, suffix: str, exif: bytes) -> bytes:
     kind = kinds.get(suffix, "PNG" if suffix == ".png" else "BMP" if suffix == ".bmp" else "PPM")
     how = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True}}.get(kind, {})
     buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, kind, **how, **({"exif": exif} if exif else {}))  # type: ignore[arg-type]
+    Image.fromarray(image).save(buffer, kind, **how, **({"exif": exif} if exif else {}))
     return buffer.getvalue()
