@@ -200,7 +200,7 @@ def _of_sum(A: FloatArray, B: FloatArray, xx: FloatArray, xy: FloatArray, yy: Fl
 
 
 def _camera_blocks(layout: Layout, sigma: Marginals, cameras: int) -> FloatArray:
-    """Covariances (C, 12, 12) of the parameters; a camera has a row for each six of those that are free."""
+    """Covariances (C, K, K) of the parameters; a camera has a row for each six of those that are free."""
     blocks = np.zeros((cameras, MAX_PARAMS, MAX_PARAMS))
     camera, columns, first = layout.shared.camera, layout.shared.columns, len(layout.slot_frame)
     for apart in range(min(MAX_PARAMS // BLOCK, len(camera))):

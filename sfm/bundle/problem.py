@@ -119,7 +119,7 @@ class BundleProblem(Value):
 
     @property
     def param_bounds(self) -> tuple[FloatArray, FloatArray]:
-        """(C, 12) the least and the largest value of each parameter."""
+        """(C, K) the least and the largest value of each parameter."""
         lower, upper = np.full(self.camera_params.shape, -np.inf), np.full(self.camera_params.shape, np.inf)
         return (
             lower if self.lower_params is None else self.lower_params,
@@ -128,7 +128,7 @@ class BundleProblem(Value):
 
     @property
     def at_bounds(self) -> BoolArray:
-        """(C, 12) which free parameters are on one of their bounds."""
+        """(C, K) which free parameters are on one of their bounds."""
         lower, upper = self.param_bounds
         return self.free_params & ((self.camera_params <= lower) | (self.camera_params >= upper))
 
