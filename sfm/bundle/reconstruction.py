@@ -22,7 +22,7 @@ Intrinsics: TypeAlias = Literal["focal", "principal_point", "extra"]
 
 
 def free_params_of(model: CameraModel, refine: Collection[Intrinsics]) -> BoolArray:
-    """(12,) which parameters of a model are of the kinds named; `extra` is the distortion."""
+    """(K,) which parameters of a model are of the kinds named; `extra` is the distortion."""
     free = np.zeros(MAX_PARAMS, bool)
     for kind, indices in (
         ("focal", model.focal_indices),
