@@ -33,7 +33,7 @@ def evaluate_views(
     """Fills the cost of each view and its block, or instead of blocks the residuals (n, 2) in px where they are wanted.
 
     Args:
-        columns: free parameters; squared_limit: see `distortion_limit`.
+        columns: free parameters; squared_limit: see `project_lanes`.
         board: (P, 3) at the current shape; basis: (P, 3, S) its derivatives by the free coefficients.
         roots: (n, 3) a, b, c of the whitening (a du + b dv, c dv).
         lost_cost: cost of an observation without projection.

@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from calib.refine_board import BoardShape, board_shape
 from calib.refine_checks import check_determined
-from calib.refine_fit import CalibrationConfig, Fit, turned_back
+from calib.refine_fit import CalibrationConfig, Fit, solve_by_stages, turned_back
 from calib.refine_lenses import lens_by_name
 from calib.refine_reject import RejectedView, reject_outliers, sort_out
 from calib.refine_system import CalibrationSystem, Estimate
@@ -30,9 +30,6 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.optim.levenberg_marquardt import Summary
 
 __all__ = ["Calibration", "CalibrationConfig", "RejectedView", "calibrate"]
-
-_CONVERGED, _EXACT = 1e-9, 1e-20
-"""Part of the cost, and px² a corner, that need not be gained."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -119,10 +116,10 @@ def calibrate(
     shown = np.bincount(observations.rows, minlength=len(board))
     shape = board_shape(config.shape, observations.board, shown >= 2)
     fit = Fit(lens, config, start, shape)
-    estimate = fit.seed(observations, homographies.errors)
-    if isinstance(estimate, Rejected):
-        return estimate
-    system, summary = fit.solve(observations, estimate)
+    solved = solve_by_stages(fit, observations, homographies.errors)
+    if isinstance(solved, Rejected):
+        return solved
+    system, summary = solved
     turned = turned_back(fit, system)
     if turned is not None:
         system, summary = fit.solve(observations, turned)
@@ -171,7 +168,7 @@ def _result(
         sigma_px=math.sqrt(2 * summary.final_cost / freedom) if freedom > 0 else math.nan,
         rung=fit.start.rung,
         fallbacks=fallbacks,
-        converged=system.newton_decrement() <= _CONVERGED * summary.final_cost + _EXACT * len(residuals),
+        converged=system.is_at_minimum(summary.final_cost),
         iterations=len(summary.iterations) - 1,
         cost=summary.final_cost,
     )

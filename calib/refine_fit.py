@@ -123,6 +123,31 @@ class Fit:
         return system, minimize(system, rules)
 
 
+def solve_by_stages(
+    fit: Fit, observations: Observations, errors: Vector
+) -> tuple[CalibrationSystem, Summary] | Rejected:
+    """Least squares from the start; see `Lens.rival` for the second attempt that some lenses have.
+
+    A minimum that is reached, and at which the distortion can be inverted at all corners, is taken for the right one.
+    Otherwise the parameters are released in the other order as well, and the lower cost wins.
+
+    Args:
+        errors: of the views' homographies.
+    """
+    estimate = fit.seed(observations, errors)
+    if isinstance(estimate, Rejected):
+        return estimate
+    system, summary = fit.solve(observations, estimate)
+    if not fit.lens.rival or (system.is_at_minimum(summary.final_cost) and system.is_invertible()):
+        return system, summary
+    rival = dataclasses.replace(fit, lens=dataclasses.replace(fit.lens, stages=fit.lens.rival))
+    estimate = rival.seed(observations, errors)
+    if isinstance(estimate, Rejected):
+        return system, summary
+    other, also = rival.solve(observations, estimate)
+    return (other, also) if also.final_cost < summary.final_cost else (system, summary)
+
+
 def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:
     """The estimate with other poses for bad views that fit better tilted the other way; None where none does.
 

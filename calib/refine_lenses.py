@@ -7,8 +7,10 @@
 | opencv4 | OPENCV | k1, k2, p1, p2 |
 | opencv5 | FULL_OPENCV, k4 = k5 = k6 = 0 | and k3: OpenCV's default |
 | opencv8 | FULL_OPENCV | and k4, k5, k6: OpenCV's rational model |
+| opencv12 | FULL_OPENCV_THIN_PRISM | and s1 … s4: OpenCV's thin prism |
 | fisheye | OPENCV_FISHEYE | k1 … k4 of Kannala and Brandt |
 | eucm | EUCM | α, β of the enhanced unified model |
+| double_sphere | DOUBLE_SPHERE | ξ, α of Usenko, Demmel and Cremers |
 | division | EUCM, α = ½ | β = −4 k of the division model, a ray ∝ (a, b, 1 + k (a² + b²)) |
 
 Parameters that are released together at first shape the image most; a rational function from zero in one step is led
@@ -36,6 +38,7 @@ class Lens:
         stages: names of the parameters that each stage releases; what none names stays as it starts.
         start: "perspective" is found by Zhang's closed form, "wide" by trying focal lengths.
         shape: start of parameters that do not start at zero.
+        rival: other stages, for a lens with so many coefficients that the cost has several minima.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Lens:
     stages: tuple[tuple[str, ...], ...]
     start: Literal["perspective", "wide"] = "perspective"
     shape: tuple[tuple[str, float], ...] = ()
+    rival: tuple[tuple[str, ...], ...] = ()
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -65,6 +69,7 @@ class Lens:
 
 
 _F, _FXY, _C = ("f",), ("fx", "fy"), ("cx", "cy")
+_RATIONAL, _PRISM = ("k4", "k5", "k6"), ("s1", "s2", "s3", "s4")
 
 LENSES: tuple[Lens, ...] = (
     Lens("pinhole", "PINHOLE", ((*_FXY, *_C),)),
@@ -72,9 +77,16 @@ LENSES: tuple[Lens, ...] = (
     Lens("radial", "RADIAL", ((*_F, *_C, "k1", "k2"),)),
     Lens("opencv4", "OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2"))),
     Lens("opencv5", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"))),
-    Lens("opencv8", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"), ("k4", "k5", "k6"))),
+    Lens("opencv8", "FULL_OPENCV", ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"), _RATIONAL)),
+    Lens(
+        "opencv12",
+        "FULL_OPENCV_THIN_PRISM",
+        ((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3"), (*_RATIONAL, *_PRISM)),
+        rival=((*_FXY, *_C, "k1", "k2"), ("p1", "p2", "k3", *_RATIONAL, *_PRISM)),
+    ),
     Lens("fisheye", "OPENCV_FISHEYE", (_FXY, (*_C, "k1", "k2"), ("k3", "k4")), start="wide"),
     Lens("eucm", "EUCM", (_FXY, (*_C, "alpha", "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
+    Lens("double_sphere", "DOUBLE_SPHERE", (_FXY, (*_C, "xi", "alpha")), start="wide", shape=(("alpha", 0.5),)),
     Lens("division", "EUCM", (_FXY, (*_C, "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
 )
 

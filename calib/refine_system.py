@@ -32,6 +32,8 @@ _LOST_PX = 1000.0
 """What an observation without projection costs, as a residual."""
 _FLOOR = 1e-12
 """Least diagonal of the damping, over the largest of its kind."""
+_CONVERGED, _EXACT = 1e-9, 1e-20
+"""Part of the cost, and px² a corner, that need not be gained."""
 _NO_RESIDUALS = np.zeros((0, 2))
 
 
@@ -182,6 +184,16 @@ class CalibrationSystem:
             return math.inf
         return -0.5 * float(np.vdot(self._gradient[0], self._by_pose) + self._gradient[1] @ self._by_shared)
 
+    def is_at_minimum(self, cost: float) -> bool:
+        """Whether one more undamped step promises less than a billionth of the cost."""
+        return self.newton_decrement() <= _CONVERGED * cost + _EXACT * len(self.observations.rows)
+
+    def is_invertible(self) -> bool:
+        """Whether all corners lie where the distortion can be inverted."""
+        o, now = self.observations, self.estimate
+        points = now.rotations[o.view_of] @ now.shape.points3D[o.rows][:, :, None]
+        return bool(np.all(now.camera.project(points[:, :, 0] + now.translations[o.view_of])[1]))
+
     def accept(self) -> None:
         """Makes the last trial current."""
         self._now, self._trial = self._trial, self._now
@@ -193,7 +205,7 @@ class CalibrationSystem:
 
     def _evaluate(self, point: _Point, residuals: FloatArray = _NO_RESIDUALS) -> None:
         o, model = self.observations, self._camera.model_info.model_id
-        limit = distortion_limit(model, point.params) ** 2 if self._keep_invertible else math.inf
+        limit = distortion_limit(model, point.params) ** 2 if self._keep_invertible else -math.inf
         board = self._shape.given
         if self._basis.shape[2]:
             board = board + self._shape.basis @ point.coefficients

@@ -1,9 +1,9 @@
 """Which shape of the board says best where corners of unseen photos are, and does not cost the camera.
 
 A board that is bent, or printed a little askew, taken for flat bends the camera. With the boards, poses and noise of
-eight sets of photos a camera from a board that is taken for flat is off by 3 to 10 times as much as one that is
+eight sets of photos a camera from a board that is taken for flat is off by 2 to 10 times as much as one that is
 calibrated along with every point of the board, where these points lie as estimated there; where the board is flat, the
-latter costs 10 to 20 % (with 13 views of 24 corners 150 %). So shapes are judged as lens models are: by views that were
+latter costs 3 to 45 % (with 13 views of 24 corners 150 %). So shapes are judged as lens models are: by views that were
 held out, and the simplest within a standard error of the best is chosen.
 
 Held-out views are blind where camera and board may be exchanged for one another: boards that are all held alike, as

@@ -12,8 +12,9 @@ Both sides start from the same numbers, free the same parameters (poses, points,
 --intrinsics fixed only poses and points), agree on the same seven freedoms (the pose of one image and one direction of
 a second, which Ceres holds and ours restores in the end), minimise the same loss on the same number of threads, and
 stop by the same rules: a step that lowers the cost by less than --tolerance of it (Ceres: function_tolerance; ours asks
-in addition that the step was little damped and had promised no more), no entry of the gradient above
---gradient-tolerance, or --max-iterations trials. COLMAP's own defaults are 0 (off), 1e-4 and 100. Ceres stops by
+in addition that the step was little damped and had promised no more) or --max-iterations trials. Ceres also stops where
+no entry of the gradient is above --gradient-tolerance; ours, which looks at angles instead, at a cosine of 1e-10.
+COLMAP's own defaults are 0 (off), 1e-4 and 100. Ceres stops by
 parameter_tolerance, too, which COLMAP leaves at 0 (off); ours stops at a step of 1e-14 of the parameters. The linear
 solver of Ceres is the one that COLMAP picks (dense Schur up to 50 images, sparse up to 1,000, then iterative with
 Schur–Jacobi), unless --ceres-solver says otherwise; below 50,000 residuals COLMAP gives Ceres one thread, which is

@@ -14,6 +14,7 @@ import pycolmap
 from scipy.spatial import KDTree
 
 from sfm.bundle import BundleProblem, free_params_of, problem_from_reconstruction, squared_errors
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.models import model_by_id, model_by_name
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -34,7 +35,7 @@ def make_problem(
     images: np.ndarray, points: np.ndarray, points2D: np.ndarray,
 ) -> BundleProblem:  # fmt: skip
     """All of one camera model, everything free but the principal points."""
-    padded = np.zeros((len(params), 12))
+    padded = np.zeros((len(params), MAX_PARAMS))
     padded[:, : params.shape[1]] = params
     info = model_by_name(model)
     return BundleProblem(

@@ -76,8 +76,7 @@ def config_of(rules: Rules) -> BundleConfig:
     """Our settings."""
     config = BundleConfig(
         loss=rules.loss, loss_scale_px=rules.loss_scale,  # type: ignore[arg-type]
-        relative_cost_tolerance=rules.tolerance, gradient_tolerance=rules.gradient_tolerance,
-        max_iterations=rules.max_iterations,
+        relative_cost_tolerance=rules.tolerance, max_iterations=rules.max_iterations,
     )  # fmt: skip
     as_before = {name: type(getattr(config, name)) for name, _ in rules.ours}
     return dataclasses.replace(config, **{name: as_before[name](value) for name, value in rules.ours})

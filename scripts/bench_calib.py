@@ -45,6 +45,7 @@ FLAGS = {
     "opencv4": cv2.CALIB_FIX_K3,
     "opencv5": 0,
     "opencv8": cv2.CALIB_RATIONAL_MODEL,
+    "opencv12": cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
     "fisheye": cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW,
 }
 
@@ -177,11 +178,11 @@ def opencv(
         points2D = [(v.points2D - 0.5).astype(np.float32).reshape(-1, 1, 2) for v in views]
         calibrate_camera = cv2.calibrateCameraExtended if deviations else cv2.calibrateCamera
         rms, K, _, _, _, *more = calibrate_camera(
-            points3D, points2D, size, np.eye(3), np.zeros(8), flags=FLAGS[lens], criteria=TIGHT
+            points3D, points2D, size, np.eye(3), np.zeros(12), flags=FLAGS[lens], criteria=TIGHT
         )
     except cv2.error as error:
         return str(error).splitlines()[0][:120]
-    # fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6 in both, but for the place of what is held.
+    # fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 in both, but for the place of what is held.
     return rms, (K[0, 0] + K[1, 1]) / 2, more[0].ravel() if deviations else None
 
 

@@ -19,6 +19,8 @@ COMMANDS = {
     "stereo": "two cameras that are mounted together, and how they stand",
     "rig": "several such cameras, of any models",
     "handeye": "where a camera sits on a robot, from photos and the robot's poses",
+    "undistort": "photos as a lens without distortion would have taken them",
+    "convert": "a calibration in another program's file: OpenCV, ROS, Kalibr, COLMAP, nerfstudio",
 }
 """In the order in which they are used; `calib.cli.<name>` holds each."""
 

@@ -47,8 +47,8 @@ class CameraOptions:
 
     model: Annotated[str, tyro.conf.arg(metavar="NAME")] = "auto"
     """auto (what predicts held-out photos best), pinhole, simple_radial, radial, opencv (k1 k2 p1 p2, as COLMAP's
-    OPENCV), opencv5 (and k3, OpenCV's own default), opencv8 (its rational model), fisheye (Kannala–Brandt), eucm,
-    division; names of COLMAP's models do as well."""
+    OPENCV), opencv5 (and k3, OpenCV's own default), opencv8 (its rational model), opencv12 (and thin prism), fisheye
+    (Kannala–Brandt), eucm, division, double_sphere; names of COLMAP's models do as well."""
 
     shape: Annotated[str, tyro.conf.arg(metavar="NAME")] = "auto"
     """What the board may be: flat, scale (stretched by the printer), paraboloid (bent), height, free (every corner lies

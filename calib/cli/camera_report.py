@@ -94,8 +94,11 @@ def camera_lines(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Su
     """Everything for the screen: parameters, errors, board, choices, what was left out, what is wrong."""
     found = made.found
     camera, corners = found.camera, len(found.residuals)
-    yield f"{len(found.observations)} of {seen.count} {seen.kind} used, {corners} corners of {_spec(seen)}"
+    kind = "photos" if seen.kind == "photos" else "views"
+    yield f"{len(found.observations)} of {seen.count} {kind} used, {corners} corners of {_spec(seen)}"
     yield f"{camera.model}, {camera.width} × {camera.height} px; lens model {found.lens}{_chosen(bool(made.lenses))}"
+    if not camera.model_info.is_in_colmap:
+        yield "COLMAP lacks this model, so `sfm run` cannot use it; `calib convert --fit` makes one that it has"
     yield from ("", *_parameter_lines(made), "", *_error_lines(made), "", *_board_lines(made))
     if made.lenses:
         yield from ("", "lens model      held-out  training  differs by px")

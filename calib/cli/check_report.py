@@ -51,9 +51,11 @@ def check_lines(
 ) -> Iterator[str]:
     """Verdict, errors, what has changed, what is wrong, what would help."""
     camera = check.found.camera
-    yield f"{'FAILED' if check.failed else 'passed'}: error {check.rms_px:.4f} px, {check.limit_px:.4f} px allowed"
+    grave = ", ".join(finding.cause for finding in check.findings if finding.cause in GRAVE)
+    yield f"{f'FAILED: {grave};' if grave else 'passed:'} error {check.rms_px:.4f} px, {check.limit_px:.4f} px allowed"
+    kind = "photos" if seen.kind == "photos" else "views"
     yield (
-        f"{len(check.found.observations)} of {seen.count} {seen.kind} of {camera.width} × {camera.height} px, "
+        f"{len(check.found.observations)} of {seen.count} {kind} of {camera.width} × {camera.height} px, "
         f"{len(check.found.residuals)} corners; only the poses of the board are fitted"
     )
     trained, held = record.number("rms_px"), record.number("holdout_rms_px")

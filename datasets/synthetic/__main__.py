@@ -9,7 +9,7 @@ import time
 from datasets.synthetic.scenes import NAMES, make_scene
 from datasets.synthetic.sensor import CLEAN, SensorConfig
 from datasets.synthetic.writer import write_scene
-from sfm.core.cameras import MODELS
+from sfm.core.cameras import COLMAP_MODELS
 from sfm.core.errors import SfmError
 
 
@@ -71,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add("-o", "--output", required=True, help="folder for images/ and truth/")
     add("--images", type=_positive, help="number of moments; the scene's own by default")
     add("--size", type=_size, default=(1280, 960), help="WIDTHxHEIGHT in px (1280x960)")
-    add("--camera-model", choices=[model.name for model in MODELS], default="SIMPLE_RADIAL")
+    add("--camera-model", choices=[model.name for model in COLMAP_MODELS], default="SIMPLE_RADIAL")
     add("--fov", type=float, help="horizontal field of view in degrees; the scene's own by default")
     add("--seed", type=int, default=0)
     add("--samples", type=_positive, default=2, help="rays a side of a pixel that needs more than one (2)")

@@ -20,6 +20,11 @@ _DISTORTION = {
     "RADIAL_FISHEYE": (0.02, -0.004),
     "THIN_PRISM_FISHEYE": (0.02, -0.004, 0.0006, -0.0004, 0.0005, 0.0, 0.0004, -0.0003),
     "EUCM": (0.6, 1.1),
+    "FULL_OPENCV_THIN_PRISM": (
+        *(-0.05, 0.02, 0.001, -0.0007, 0.002, 0.06, 0.01, 0.001),
+        *(0.0006, -0.0003, -0.0004, 0.0002),
+    ),
+    "DOUBLE_SPHERE": (-0.2, 0.55),
 }
 """Typical lenses: a few per cent of barrel distortion at the corner."""
 
@@ -37,7 +42,7 @@ def example_camera(model: str, width: int, height: int, *, fov_deg: float = 60.0
     half = np.deg2rad(fov_deg) / 2
     if model == "EQUIRECTANGULAR":
         return Camera(model, width, height, np.array([width, height], float), has_prior_focal_length=True)
-    focal = width / 2 / (half if info.is_fisheye and model != "EUCM" else np.tan(half))
+    focal = width / 2 / (half if info.is_fisheye and model not in ("EUCM", "DOUBLE_SPHERE") else np.tan(half))
     # A principal point that is not quite the centre, as in real cameras.
     centre = (width / 2 + 0.004 * width, height / 2 - 0.003 * width)
     focals = [focal] * len(info.focal_indices)

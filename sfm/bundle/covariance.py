@@ -6,10 +6,11 @@ reduced matrix S is the covariance Σ of poses and shared parameters, and that o
 
     Σ = S⁻¹        Σ_p = M_p + M_p E_pᵀ Σ E_p M_p
 
-so the whole inverse, points against points, is never formed. What the scene as a whole may do (turn, move, grow) is
-not determined by images. `two_cameras` measures everything relative to two images, `three_points` to three points,
-whose own uncertainty is then zero where they are held. `free` spreads it: with Q an orthonormal basis of these motions,
-as they move poses and parameters, and S⁻ any inverse on what is left,
+so the whole inverse, points against points, is never formed; and of Σ only the blocks that these need, see `marginals`.
+What the scene as a whole may do (turn, move, grow) is not determined by images. `two_cameras` measures everything
+relative to two images, `three_points` to three points, whose own uncertainty is then zero where they are held. `free`
+spreads it: with Q an orthonormal basis of these motions, as they move poses and parameters, and S⁻ any inverse on what
+is left,
 
     Σ = (1 − Q Qᵀ) S⁻ (1 − Q Qᵀ)
 
@@ -27,24 +28,24 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.linalg import get_lapack_funcs
 
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.bundle.adjustment import system_of
 from sfm.bundle.gauge import frame_centers, held_by_three_points
-from sfm.bundle.knowledge import motions_seen
-from sfm.bundle.layout import Layout
+from sfm.bundle.knowledge import Knowledge, motions_seen
+from sfm.bundle.layout import Layout, lay_out
+from sfm.bundle.marginals import Marginals
 from sfm.bundle.problem import BundleConfig, BundleProblem
-from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
+from sfm.bundle.reduced import plan_solver
+from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
+from sfm.core.execution import ordered_map
 from sfm.core.geometry.rotation import skew
+from sfm.core.optim.block_pattern import BLOCK
 
-_SINGULAR = 1e-12
-"""Least pivot, of a matrix with ones on its diagonal, that is not a rounding error."""
 _POINT_CONDITION = 1e10
 """Trace of the information about a point times that of its inverse, beyond which the point is not determined."""
-_potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=np.float64)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +56,7 @@ class BundleCovariance(Value):
         poses: (I, 6, 6) of the tangent (ω, υ) of `cams_from_world`, radians and scene units, update on the left; zero
             where a pose is constant or held, NaN where no observation sees it.
         centers: (I, 3, 3) of the camera centres in the world.
-        params: (C, 12, 12) of the camera parameters; zero where they are constant.
+        params: (C, K, K) of the camera parameters; zero where they are constant or on a bound, which holds them.
         points3D: (P, 3, 3); zero where a point is constant, NaN where its views do not determine it.
         variance_factor: twice the cost over the degrees of freedom. Where the stated standard deviations are only
             proportional to the true ones, all covariances times this are right; see `scaled`.
@@ -83,27 +84,31 @@ def covariance(
 ) -> BundleCovariance | Rejected:
     """Covariances at the parameters of `problem`, which should be a minimum: the `problem` of a `BundleResult`.
 
-    Takes some 32 N² bytes for N free entries of poses, cameras and sensors.
+    Takes a few times the time of a step of the adjustment with a factor, and memory as `covariance_bytes` says.
 
     Returns:
         `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave
         open as detail.
     """
-    system, _ = system_of(problem, dataclasses.replace(config, solver="dense"), threads)
+    problem = dataclasses.replace(problem, free_params=problem.free_params & ~problem.at_bounds)
+    system, _ = system_of(problem, _with_factor(config), threads)
     layout, (cost, _) = system.layout, system.linearize()
     held = held_by_three_points(problem, layout) if config.gauge == "three_points" else None
     known = system.information(held)
     motions = _motions(problem, layout)
     if config.gauge != "free":
         motions = motions[:, :0]
-    sigma = _inverse(known.reduced, ~system.held.ravel(), motions)
+    sigma = system.inverse(motions)
     if isinstance(sigma, int):
         return _undetermined(sigma, problem, layout)
     points = np.zeros((len(problem.points3D), 3, 3))
-    kernels.point_covariances(
-        system.free_points, layout.offsets, *known.couplings, known.centers, system.points3D, known.V, known.M, sigma,
-        _POINT_CONDITION, points,
-    )  # fmt: skip
+    list(ordered_map(
+        lambda part: kernels.point_covariances(
+            *part, system.free_points, layout.offsets, *known.couplings, known.centers, system.points3D, known.V,
+            known.M, sigma.pattern.offsets, sigma.pattern.columns, sigma.blocks, _POINT_CONDITION, points,
+        ),
+        layout.point_chunks, threads=threads,
+    ))  # fmt: skip
     freedom = 2 * len(layout.image) + system.prior_count - system.free_count + motions.shape[1]
     freedom += sum(3 - basis.shape[1] for basis in held.bases) if held is not None else 0
     poses, centers = _pose_blocks(problem, layout, sigma)
@@ -116,28 +121,19 @@ def covariance(
     )
 
 
-def _inverse(S: FloatArray, free: BoolArray, motions: FloatArray) -> FloatArray | int:
-    """Σ with zeros where entries are not `free`, or the entry that S leaves open beside the `motions` (N, m)."""
-    rows = np.flatnonzero(free)
-    if not len(rows):
-        return np.zeros_like(S)
-    S, basis = S[np.ix_(rows, rows)], np.linalg.qr(motions[rows])[0]
-    diagonal = np.diag(S).copy()
-    if not (diagonal > 0).all():
-        return int(rows[np.argmin(diagonal > 0)])
-    scale = 1 / np.sqrt(diagonal)
-    scaled = np.linalg.qr(motions[rows] / scale[:, None])[0]
-    full = S * scale * scale[:, None] + scaled @ scaled.T
-    factor, failed = _potrf(full, lower=1)
-    if failed or (np.diag(factor) ** 2).min() < _SINGULAR:
-        return int(rows[np.argmax(np.abs(np.linalg.eigh(full)[1][:, 0]))])
-    inverse, _ = _potri(factor, lower=1)
-    inverse = (np.tril(inverse) + np.tril(inverse, -1).T) * scale * scale[:, None]
-    inverse -= basis @ (basis.T @ inverse)
-    inverse -= (inverse @ basis) @ basis.T
-    sigma = np.zeros((len(free), len(free)))
-    sigma[np.ix_(rows, rows)] = inverse
-    return sigma
+def covariance_bytes(problem: BundleProblem, config: BundleConfig = BundleConfig()) -> int:
+    """About the memory that `covariance` takes, without taking it."""
+    layout = lay_out(problem, np.ones(len(problem.obs_images), bool))
+    plan = plan_solver(layout, layout.padding, Knowledge(problem, layout).targets, _with_factor(config).solver)
+    blocks = 8 * BLOCK * BLOCK * len(plan.pattern.columns)
+    # Dense, the factor once more as a square, and its inverse.
+    square = 16 * int(np.sum(~layout.padding)) ** 2 if plan.forecast.kind == "dense" else 0
+    return plan.bytes + 3 * blocks + square + 200 * len(layout.image) + 300 * len(problem.points3D)
+
+
+def _with_factor(config: BundleConfig) -> BundleConfig:
+    """The same with a solver that has a factor."""
+    return config if config.solver in ("dense", "sparse") else dataclasses.replace(config, solver="exact")
 
 
 def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
@@ -166,59 +162,54 @@ def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
         unmoved = np.zeros((np.sum(~problem.rigs.free_sensors), 3, 7))
         unmoved[:, :, 6] = lengths[~problem.rigs.free_sensors]
         forbidden.append(unmoved.reshape(-1, 7))
-    forbidden += [motions_seen(problem, layout, tangents)]
+    forbidden += [motions_seen(problem, layout, tangents, shared)]
     _, sizes, directions = np.linalg.svd(np.concatenate(forbidden))
     allowed = directions[sizes <= 1e-9 * max(float(sizes.max()), 1e-300)].T
     free = np.concatenate([tangents[layout.slot_frame], shared])
     return free.reshape(-1, 7)[: 6 * (poses + len(shared))] @ allowed
 
 
-def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _pose_blocks(problem: BundleProblem, layout: Layout, sigma: Marginals) -> tuple[FloatArray, FloatArray]:
     """Covariances (I, 6, 6) of the poses' tangents on the left, and of the centres (I, 3, 3).
 
-    With the frame's tangent δ in world axes a camera moves by R [I, 0; −[c]×, I] δ, c from the frame's centre to its
-    own, plus what its sensor's tangent μ adds.
+    With the frame's tangent δ in world axes a camera moves by J δ + μ,  J = R [I, 0; −[c]×, I], c from the frame's
+    centre to its own, and μ its sensor's tangent.
     """
-    poses = problem.cams_from_world
-    blocks, centers = np.zeros((len(poses), 6, 6)), np.zeros((len(poses), 3, 3))
-    blocks[problem.free_poses], centers[problem.free_poses] = np.nan, np.nan
-    R, frames = poses.rotation.matrix, frame_centers(problem)
-    seen = np.bincount(layout.image, minlength=len(poses)) > 0
-    mounts = _sensor_rows(layout)
-    for image in np.flatnonzero(seen):
-        rows, columns = [], []
-        if layout.image_slot[image] >= 0:
-            turn = np.zeros((6, 6))
-            turn[:3, :3] = turn[3:, 3:] = R[image]
-            turn[3:, :3] = -R[image] @ skew(poses[image].center - frames[layout.image_frame[image]])
-            rows.append(layout.image_slot[image])
-            columns.append(turn)
-        for row in layout.image_shared[image]:
-            if row in mounts:
-                rows.append(row)
-                columns.append(np.eye(6))
-        if not rows:
-            blocks[image], centers[image] = 0.0, 0.0
-            continue
-        J = np.concatenate(columns, axis=1)
-        index = np.concatenate([np.arange(6 * row, 6 * row + 6) for row in rows])
-        blocks[image] = J @ sigma[np.ix_(index, index)] @ J.T
-        centers[image] = R[image].T @ blocks[image][3:, 3:] @ R[image]
+    poses, count = problem.cams_from_world, len(layout.image_slot)
+    unseen = np.bincount(layout.image, minlength=count) == 0  # and perhaps not finite
+    ends = (poses.center, frame_centers(problem)[layout.image_frame])
+    here, frame = (np.where(unseen[:, None], 0.0, place) for place in ends)
+    R, arms = poses.rotation.matrix, here - frame
+    J = np.zeros((count, 6, 6))
+    J[:, :3, :3] = J[:, 3:, 3:] = R
+    J[:, 3:, :3] = -R @ skew(arms)
+    # The centre straight from the frame's, so that what is held stays exactly zero.
+    K, back = np.zeros((count, 3, 6)), np.zeros((count, 3, 6))
+    K[:, :, :3], K[:, :, 3:], back[:, :, 3:] = -skew(arms), np.eye(3), R.transpose(0, 2, 1)
+    frames, sensors = layout.image_slot.astype(np.int64), layout.image_sensor_row
+    both = sigma.between(frames, frames), sigma.between(frames, sensors), sigma.between(sensors, sensors)
+    blocks, centers = _of_sum(J, np.broadcast_to(np.eye(6), J.shape), *both), _of_sum(K, back, *both)
+    blocks[unseen & problem.free_poses], centers[unseen & problem.free_poses] = np.nan, np.nan
     return blocks, centers
 
 
-def _sensor_rows(layout: Layout) -> set[int]:
-    """Numbers of the rows that are tangents of sensors."""
-    return {len(layout.slot_frame) + int(k) for k in np.flatnonzero(layout.shared.sensor >= 0)}
+def _of_sum(A: FloatArray, B: FloatArray, xx: FloatArray, xy: FloatArray, yy: FloatArray) -> FloatArray:
+    """Covariances of A x + B y from those of x and y."""
+    crossed = A @ xy @ B.transpose(0, 2, 1)
+    return A @ xx @ A.transpose(0, 2, 1) + crossed + crossed.transpose(0, 2, 1) + B @ yy @ B.transpose(0, 2, 1)
 
 
-def _camera_blocks(layout: Layout, sigma: FloatArray, cameras: int) -> FloatArray:
+def _camera_blocks(layout: Layout, sigma: Marginals, cameras: int) -> FloatArray:
+    """Covariances (C, K, K) of the parameters; a camera has a row for each six of those that are free."""
     blocks = np.zeros((cameras, MAX_PARAMS, MAX_PARAMS))
-    shared, first = layout.shared, len(layout.slot_frame)
-    for camera in np.unique(shared.camera[shared.camera >= 0]):
-        mine, place = np.nonzero((shared.columns >= 0) & (shared.camera == camera)[:, None])
-        columns, entries = shared.columns[mine, place], 6 * (first + mine) + place
-        blocks[camera][np.ix_(columns, columns)] = sigma[np.ix_(entries, entries)]
+    camera, columns, first = layout.shared.camera, layout.shared.columns, len(layout.slot_frame)
+    for apart in range(min(MAX_PARAMS // BLOCK, len(camera))):
+        one = apart + np.flatnonzero((camera[apart:] >= 0) & (camera[apart:] == camera[: len(camera) - apart]))
+        found = sigma.between(first + one, first + one - apart)
+        rows, others = columns[one], columns[one - apart]
+        k, a, b = np.nonzero((rows >= 0)[:, :, None] & (others >= 0)[:, None, :])
+        blocks[camera[one[k]], rows[k, a], others[k, b]] = found[k, a, b]
+        blocks[camera[one[k]], others[k, b], rows[k, a]] = found[k, a, b]
     return blocks
 
 

@@ -6,17 +6,19 @@ Camera parameters that are expected to be θ₀ with standard deviation σ add �
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm.bundle.gauge import frame_centers
 from sfm.bundle.layout import Layout
+from sfm.bundle.mounted_terms import by_sensors, on_frames
 from sfm.bundle.prior_terms import (
     PriorTerms,
     bias_count,
     linearize_point_priors,
     linearize_priors,
-    on_frames,
     point_prior_cost,
     prior_cost,
 )
@@ -42,16 +44,17 @@ class Knowledge:
         self._seen = (np.diff(layout.offsets) > 0) & problem.free_points
         self._expected = _ExpectedParams.of(problem, layout)
         self._biases = bias_count(self._poses)
-        terms = self._terms_at(problem)
-        first, second = self._rows_of(terms.first), self._rows_of(terms.second)
-        self._first, self._second = np.flatnonzero(first >= 0), np.flatnonzero(second >= 0)
-        self._both = np.flatnonzero((first >= 0) & (second >= 0))
-        self._row, self._other = first, second
-        shared = self._expected.block_rows
-        rows, columns = first[self._both], second[self._both]
+        self._rows = self._rows_of(self._terms_at(problem))
+        self._pieces = [np.flatnonzero(rows >= 0) for rows in self._rows]
+        self._pairs = [
+            (a, b, np.flatnonzero((self._rows[a] >= 0) & (self._rows[b] >= 0)))
+            for a, b in itertools.combinations(range(len(self._rows)), 2)
+        ]
+        own = [self._expected.block_rows] + [rows[mine] for rows, mine in zip(self._rows, self._pieces, strict=True)]
+        ends = [(self._rows[a][both], self._rows[b][both]) for a, b, both in self._pairs]
         self.targets = RowTerms(
-            np.concatenate([shared, first[self._first], second[self._second], np.maximum(rows, columns)]),
-            np.concatenate([shared, first[self._first], second[self._second], np.minimum(rows, columns)]),
+            np.concatenate(own + [np.maximum(*pair) for pair in ends]),
+            np.concatenate(own + [np.minimum(*pair) for pair in ends]),
         )
         self.count = len(self._expected.weights) + 3 * self._biases + _measured(problem)
 
@@ -68,19 +71,18 @@ class Knowledge:
         if not self._poses:
             return cost, self._expected.blocks, gradient
         of_poses, terms = self._terms(turns, centers, frame_centers, biases)
-        J1, J2 = terms.jacobian_first, terms.jacobian_second
-        crossed = np.einsum("kca,kcb->kab", J1[self._both], J2[self._both])
-        upper = self._row[self._both] < self._other[self._both]
-        crossed[upper] = crossed[upper].transpose(0, 2, 1)
-        blocks = np.concatenate([
-            self._expected.blocks,
-            np.einsum("kca,kcb->kab", J1[self._first], J1[self._first]),
-            np.einsum("kca,kcb->kab", J2[self._second], J2[self._second]),
-            crossed,
-        ])  # fmt: skip
-        for J, mine, row in ((J1, self._first, self._row), (J2, self._second, self._other)):
-            np.add.at(gradient, row[mine], np.einsum("kca,kc->ka", J[mine], terms.residuals[mine]))
-        return cost + of_poses, blocks, gradient
+        J = terms.jacobians
+        blocks = [self._expected.blocks]
+        blocks += [J[a][mine].transpose(0, 2, 1) @ J[a][mine] for a, mine in enumerate(self._pieces)]
+        for a, b, both in self._pairs:
+            crossed = J[a][both].transpose(0, 2, 1) @ J[b][both]
+            mirrored = crossed.transpose(0, 2, 1)
+            one, other = self._rows[a][both, None, None], self._rows[b][both, None, None]
+            blocks.append(np.where(one > other, crossed, mirrored) + np.where(one == other, crossed, 0.0))
+        for a, mine in enumerate(self._pieces):
+            pull = np.einsum("kca,kc->ka", J[a][mine], terms.residuals[mine])
+            np.add.at(gradient, self._rows[a][mine], pull)
+        return cost + of_poses, np.concatenate(blocks), gradient
 
     def linearize_points(self, points3D: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Cost, information (P, 6) and gradient (P, 3) of what is about points; zero for points that do not move."""
@@ -105,44 +107,75 @@ class Knowledge:
 
     def _terms(
         self, turns: FloatArray, centers: FloatArray, frame_centers: FloatArray, biases: FloatArray
-    ) -> tuple[float, PriorTerms]:
+    ) -> tuple[float, _Terms]:
         cost, terms = linearize_priors(self._poses, turns, centers, biases)
-        if self._rigs is not None:
-            frames = self._layout.image_frame
-            terms = on_frames(terms, frames, centers - frame_centers[frames], len(self._layout.frame_slot))
-        return cost, terms
+        if self._rigs is None:
+            return cost, _Terms(terms.residuals, (terms.first, terms.second), _jacobians(terms))
+        frames = self._layout.image_frame
+        mounted = on_frames(terms, frames, centers - frame_centers[frames], len(self._layout.frame_slot))
+        numbers, jacobians = (mounted.first, mounted.second), _jacobians(mounted)
+        if np.any(self._rigs.free_sensors):
+            images = len(turns)
+            mounts = tuple(np.where(n < images, n, -1) for n in (terms.first, terms.second))
+            numbers, jacobians = (*numbers, *mounts), (*jacobians, *by_sensors(terms, turns))
+        return cost, _Terms(terms.residuals, numbers, jacobians)
 
-    def _terms_at(self, problem: BundleProblem) -> PriorTerms:
+    def _terms_at(self, problem: BundleProblem) -> _Terms:
         if not self._poses:
-            none = np.zeros(0, np.int32)
-            return PriorTerms(np.zeros((0, 3)), none, none, np.zeros((0, 3, 6)), np.zeros((0, 3, 6)))
+            none = np.zeros((0, 3, 6))
+            return _Terms(np.zeros((0, 3)), (np.zeros(0, np.int32),) * 2, (none, none))
         poses, biases = problem.cams_from_world, np.zeros((self._biases, 3))
         return self._terms(poses.rotation.matrix, poses.center, frame_centers(problem), biases)[1]
 
-    def _rows_of(self, numbers: np.ndarray) -> np.ndarray:
+    def _rows_of(self, terms: _Terms) -> list[np.ndarray]:
         """Rows of the unknowns of terms, −1 for none and for what does not move."""
         layout, frames = self._layout, len(self._layout.frame_slot)
-        rows = np.full(len(numbers), -1)
-        posed = (numbers >= 0) & (numbers < frames)
-        rows[posed] = layout.frame_slot[numbers[posed]]
         biases = len(layout.slot_frame) + np.flatnonzero(layout.shared.bias >= 0)
-        rows[numbers >= frames] = biases[numbers[numbers >= frames] - frames]
-        return rows
+        found = []
+        for numbers in terms.numbers[:2]:
+            rows = np.full(len(numbers), -1)
+            posed = (numbers >= 0) & (numbers < frames)
+            rows[posed] = layout.frame_slot[numbers[posed]]
+            rows[numbers >= frames] = biases[numbers[numbers >= frames] - frames]
+            found.append(rows)
+        sensors = layout.image_sensor_row
+        return found + [np.where(images >= 0, sensors[images], -1) for images in terms.numbers[2:]]
 
 
-def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray) -> FloatArray:
+class _Terms(NamedTuple):
+    """Residuals of n terms and their derivatives by two unknowns, or by four.
+
+    Attributes:
+        residuals: (n, 3).
+        numbers: (n,) each; of two frames or biases as in `prior_terms`, then of the two images whose sensors may move.
+        jacobians: (n, 3, 6) each.
+    """
+
+    residuals: FloatArray
+    numbers: tuple[np.ndarray, ...]
+    jacobians: tuple[FloatArray, ...]
+
+
+def _jacobians(terms: PriorTerms) -> tuple[FloatArray, ...]:
+    return terms.jacobian_first, terms.jacobian_second
+
+
+def motions_seen(problem: BundleProblem, layout: Layout, tangents: FloatArray, shared: FloatArray) -> FloatArray:
     """(n, 7) what priors see of motions of the whole scene: their residuals' derivatives, rows of length 1.
 
     Args:
         tangents: (F, 6, 7) by which the frames move; a point X moves by  a × X + b + c X.
+        shared: (T, 6, 7) by which the shared rows do.
     """
     known = Knowledge(problem, layout)
-    terms = known._terms_at(problem)
-    frames = len(tangents)
-    rows = np.zeros((len(terms.first), 3, 7))
-    for number, jacobian in ((terms.first, terms.jacobian_first), (terms.second, terms.jacobian_second)):
+    terms, sensors = known._terms_at(problem), known._rows[2:]
+    frames, poses = len(tangents), len(layout.slot_frame)
+    rows = np.zeros((len(terms.residuals), 3, 7))
+    for number, jacobian in zip(terms.numbers[:2], terms.jacobians, strict=False):
         posed = (number >= 0) & (number < frames)
         rows[posed] += jacobian[posed] @ tangents[number[posed]]
+    for row, jacobian in zip(sensors, terms.jacobians[2:], strict=True):
+        rows[row >= 0] += jacobian[row >= 0] @ shared[row[row >= 0] - poses]
     seen = [rows.reshape(-1, 7)]
     for prior in problem.point_priors:
         X = problem.points3D[prior.points]
@@ -172,9 +205,7 @@ class _ExpectedParams:
 
     @staticmethod
     def of(problem: BundleProblem, layout: Layout) -> _ExpectedParams:
-        shared = layout.shared
-        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
-        camera, column = shared.camera[row], shared.columns[row, place]
+        camera, column, row, place = layout.parameters
         expected = weights = np.zeros(0)
         if problem.prior_params is not None and problem.prior_sigmas is not None:
             expected, weights = problem.prior_params[camera, column], problem.prior_sigmas[camera, column] ** -2.0
@@ -183,8 +214,7 @@ class _ExpectedParams:
         rows, number = np.unique(row, return_inverse=True)
         blocks = np.zeros((len(rows), BLOCK, BLOCK))
         blocks[number, place, place] = weights
-        poses, cells = len(layout.slot_frame), (camera[known], column[known])
-        return _ExpectedParams(cells, (poses + row, place), expected[known], weights, poses + rows, blocks)
+        return _ExpectedParams((camera[known], column[known]), (row, place), expected[known], weights, rows, blocks)
 
     def linearize(self, params: FloatArray, gradient: FloatArray) -> float:
         """The cost, and its gradient into that of all rows (rows, 6)."""

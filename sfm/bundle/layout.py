@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 
 import numpy as np
 
@@ -25,8 +26,8 @@ from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.execution import chunk_bounds
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
-_OBSERVATIONS_PER_CHUNK = 8192
-_MAX_CHUNKS = 16
+_OBSERVATIONS_PER_CHUNK, _MAX_CHUNKS = 8192, 16
+"""At most, and chunks are a power of two: three would keep one of two threads waiting."""
 _OWN_WORK, _NARROW_WORK = 4.0, 0.6
 """What a coupling takes beside its products with others, and what a product of three rows takes instead of six."""
 SENSOR_COLUMN = MAX_PARAMS
@@ -120,6 +121,20 @@ class Layout:
         """Whether no shared row has more than three unknowns."""
         return not np.any(self.shared.columns[:, 3:] >= 0)
 
+    @property
+    def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(K,) camera and column of each free camera parameter, its row of six and its place there."""
+        shared = self.shared
+        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        return shared.camera[row], shared.columns[row, place], len(self.slot_frame) + row, place
+
+    @property
+    def image_sensor_row(self) -> np.ndarray:
+        """(I,) the row of each image's sensor, −1 where it has none that moves."""
+        mounts = len(self.slot_frame) + np.flatnonzero(self.shared.sensor >= 0)
+        rows = np.where(np.isin(self.image_shared, mounts), self.image_shared, -1)
+        return rows.max(axis=1, initial=-1).astype(np.int64)
+
     def pattern(self, rows: np.ndarray, columns: np.ndarray) -> BlockPattern:
         """The blocks of S that points and images fill, and those in `rows` and `columns`, of the lower triangle."""
         marked = np.zeros((self.rows, self.rows // 64 + 1), np.uint64)
@@ -176,7 +191,7 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
         point, image_shared.take(image, axis=0), problem.free_points, len(slot_frame) + len(shared)
     )
     couples = (slots >= 0) & _changes(point, slots)
-    chunks = int(np.clip(len(point) // _OBSERVATIONS_PER_CHUNK, 1, _MAX_CHUNKS))
+    chunks = min(1 << max(math.ceil(len(point) / _OBSERVATIONS_PER_CHUNK) - 1, 0).bit_length(), _MAX_CHUNKS)
     return Layout(
         original=by_point,
         image_offsets=image_offsets,

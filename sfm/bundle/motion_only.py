@@ -38,7 +38,7 @@ from sfm.core.execution import chunk_bounds, ordered_map
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
-from sfm.core.optim.levenberg_marquardt import Iteration, StopReason, StopRules, Summary, Trial, minimize
+from sfm.core.optim.levenberg_marquardt import Iteration, StopReason, StopRules, Summary, Trial, minimize, steepness
 from sfm.core.optim.losses import Loss, evaluate_loss, loss_id
 from sfm.core.optim.solvers import forecast_cheapest, make_solver
 
@@ -61,7 +61,7 @@ class MotionConfig:
     relative_cost_tolerance: float = 1e-8
     """Stop where a full step lowers the cost by less than this part."""
     gradient_tolerance: float = 1e-10
-    """Stop where no entry of the gradient exceeds this; px² per radian or scene unit."""
+    """Stop where no cosine |g| / √(2 F H) of a gradient and a diagonal entry exceeds this; without a unit."""
 
     def __post_init__(self) -> None:
         loss_id(self.loss)
@@ -168,6 +168,7 @@ class MotionSystem:
         diagonal = np.einsum("iaa->ia", self._blocks[self._pattern.diagonal])
         largest = diagonal.max(axis=0, initial=0.0)
         self._diagonal = np.maximum(diagonal, np.where(largest > 0, _FLOOR * largest, 1.0)).ravel()
+        self._steepness = steepness(self._gradient, diagonal.ravel(), cost)
         return cost, float(np.abs(self._gradient).max(initial=0.0))
 
     def try_step(self, damping: float) -> Trial | None:
@@ -181,7 +182,7 @@ class MotionSystem:
         cost = self._evaluate(self._trial, False)
         decrease = 0.5 * float(damping * self._diagonal @ delta**2 - self._gradient @ delta)
         norm = np.sqrt(np.sum(self._now.centers**2) + len(self._now.wxyz))
-        return Trial(cost, decrease, float(np.linalg.norm(delta)), float(norm))
+        return Trial(cost, decrease, float(np.linalg.norm(delta)), float(norm), self._steepness)
 
     def accept(self) -> None:
         """Makes the last trial current."""
@@ -216,7 +217,7 @@ class MotionSystem:
         both = np.flatnonzero((one >= 0) & (two >= 0))
         coupling = H[both, BLOCK:, :BLOCK]
         coupling = np.where((two > one)[both, None, None], coupling, coupling.swapaxes(1, 2))
-        np.add.at(blocks, _numbers(self._pattern, np.maximum(one, two)[both], np.minimum(one, two)[both]), coupling)
+        np.add.at(blocks, self._pattern.find(np.maximum(one, two)[both], np.minimum(one, two)[both]), coupling)
         return blocks, gradient
 
 
@@ -253,10 +254,3 @@ def _jobs(offsets: np.ndarray) -> list[tuple[int, int]]:
     """Ranges of pairs with about the same number of matches."""
     edges = np.searchsorted(offsets, [last for _, last in chunk_bounds(int(offsets[-1]), _CHUNKS)])
     return [(int(a), int(b)) for a, b in itertools.pairwise([0, *edges]) if a < b]
-
-
-def _numbers(pattern: BlockPattern, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The numbers of blocks that the pattern has."""
-    wide = np.int64(pattern.rows)
-    keys = np.repeat(np.arange(pattern.rows), np.diff(pattern.offsets)) * wide + pattern.columns
-    return np.searchsorted(keys, rows * wide + columns)

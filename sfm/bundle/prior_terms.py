@@ -114,48 +114,6 @@ def point_prior_residuals(prior: PointPrior, points3D: Float64[np.ndarray, "P 3"
     return _point_residuals(prior, points3D)[1]
 
 
-def on_frames(
-    terms: PriorTerms, image_frames: Int32[np.ndarray, " I"], arms: Float64[np.ndarray, "I 3"], frames: int
-) -> PriorTerms:
-    """The terms by the poses of F frames, in which images are mounted, instead of those of the images.
-
-    Moving a frame by (ω, υ) about its own centre moves an image at the arm a from there by (ω, υ + ω × a). A term whose
-    two images are on one frame gets that alone. How images are mounted counts as constant.
-
-    Args:
-        image_frames: the frame of each image.
-        arms: C_image − C_frame, in the world.
-    """
-    images = len(image_frames)
-    numbers, jacobians = [], []
-    for number, jacobian in ((terms.first, terms.jacobian_first), (terms.second, terms.jacobian_second)):
-        of_image = (number >= 0) & (number < images)
-        row = np.where(of_image, number, 0)
-        moved = jacobian.copy()
-        moved[of_image, :, :3] -= (jacobian[:, :, 3:] @ skew(arms[row]))[of_image]
-        numbers.append(np.where(of_image, image_frames[row], np.where(number >= 0, number - images + frames, -1)))
-        jacobians.append(moved)
-    first, second = (number.astype(np.int32) for number in numbers)
-    same = first == second
-    jacobians[0][same] += jacobians[1][same]
-    jacobians[1][same], second[same] = 0.0, -1
-    return PriorTerms(terms.residuals, first, second, *jacobians)
-
-
-def coupled(priors: Sequence[Prior], images: int) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (m,) of the pairs of unknowns, larger and smaller, that share a term; each pair once, sorted."""
-    pairs, bias = [np.zeros((0, 2), np.int32)], images
-    for prior in priors:
-        if isinstance(prior, DistancePrior):
-            pairs.append(np.stack([np.maximum(prior.first, prior.second), np.minimum(prior.first, prior.second)], 1))
-        elif _has_bias(prior):
-            rows = np.unique(prior.images)
-            pairs.append(np.stack([np.full(len(rows), bias, np.int32), rows], 1))
-            bias += 1
-    unique = np.unique(np.concatenate(pairs), axis=0)
-    return unique[:, 0].astype(np.int32), unique[:, 1].astype(np.int32)
-
-
 def linearize_point_priors(
     priors: Sequence[PointPrior], points3D: Float64[np.ndarray, "P 3"]
 ) -> tuple[float, FloatArray, FloatArray]:

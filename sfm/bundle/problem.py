@@ -10,55 +10,15 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
 from sfm.bundle.priors import PointPrior, Prior, check_rows, where_finite
+from sfm.bundle.rig_arrays import RigArrays, check_in_range
 from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.models import model_by_id
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.levenberg_marquardt import Iteration, StopReason
 from sfm.core.optim.losses import Loss
 
-SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "iterative"]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class RigArrays(Value):
-    """Images that were taken at one moment by sensors mounted together, and how these are mounted.
-
-    Attributes:
-        image_frames: (I,) the row of the moment of each image.
-        image_sensors: (I,) the row of the sensor that took it, −1 for the rig's reference.
-        rigs_from_world: batch (F,), the pose of the rig at each moment.
-        sensors_from_rig: batch (Q,).
-        free_sensors: (Q,) which sensors may move on their rig.
-
-    Raises:
-        ValueError: shapes disagree or a row does not exist.
-    """
-
-    image_frames: Int32[np.ndarray, " I"]
-    image_sensors: Int32[np.ndarray, " I"]
-    rigs_from_world: Rigid3
-    sensors_from_rig: Rigid3
-    free_sensors: Bool[np.ndarray, " Q"]
-
-    def __post_init__(self) -> None:
-        images, sensors = len(self.image_frames), len(self.free_sensors)
-        object.__setattr__(self, "image_frames", readonly(self.image_frames, (images,), np.int32))
-        object.__setattr__(self, "image_sensors", readonly(self.image_sensors, (images,), np.int32))
-        object.__setattr__(self, "free_sensors", readonly(self.free_sensors, (sensors,), np.bool_))
-        if self.sensors_from_rig.shape != (sensors,) or len(self.rigs_from_world.shape) != 1:
-            raise ValueError(f"{self.sensors_from_rig.shape} poses for {sensors} sensors")
-        _check_rows("image_frames", self.image_frames, self.rigs_from_world.shape[0])
-        _check_rows("image_sensors", self.image_sensors + 1, sensors + 1)
-
-    @property
-    def cams_from_world(self) -> Rigid3:
-        """Poses (I,) of the images."""
-        mounted = self.sensors_from_rig
-        turns = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], mounted.rotation.wxyz])
-        mounts = Rigid3(Rotation3(turns), np.concatenate([np.zeros((1, 3)), mounted.translation]))
-        return mounts[self.image_sensors + 1] @ self.rigs_from_world[self.image_frames]
+SolverChoice: TypeAlias = Literal["auto", "dense", "sparse", "exact", "cholmod", "iterative"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -67,17 +27,19 @@ class BundleProblem(Value):
 
     Attributes:
         model_ids: (C,) numbers of the camera models.
-        camera_params: (C, 12) parameters in the order of the model, padded with zeros.
+        camera_params: (C, K) parameters in the order of the model, padded with zeros; K = MAX_PARAMS holds any.
         image_cameras: (I,) the row of the camera of each image.
         cams_from_world: batch (I,), in scene units.
         points3D: (P, 3) in the world.
         obs_images, obs_points: (n,) the image row and the point row of each observation, in any order.
         obs_points2D: (n, 2) px.
-        free_params: (C, 12) which camera parameters may change; padding must be False.
+        free_params: (C, K) which camera parameters may change; padding must be False.
         free_poses, free_points: (I,) and (P,).
         obs_sigmas: (n,) standard deviations by which residuals are divided: in px, or up to a common factor; None is 1
             for all.
-        prior_params, prior_sigmas: (C, 12) what free camera parameters are expected to be, and the standard deviation
+        lower_params, upper_params: (C, K) what free camera parameters may be at least and at most; −inf and inf bound
+            nothing, and so does None for all.
+        prior_params, prior_sigmas: (C, K) what free camera parameters are expected to be, and the standard deviation
             of that; inf expects nothing, and so does None for all.
         rigs: where images were taken together; `cams_from_world` must be that of the rigs then, and a rig moves where
             all of its images may. None lets every image move by itself.
@@ -85,7 +47,8 @@ class BundleProblem(Value):
 
     Raises:
         ValueError: shapes disagree, a row or a model does not exist, a parameter that the model lacks is free, a
-            standard deviation is not positive, an expected parameter is not finite, or poses are not those of the rigs.
+            standard deviation is not positive, an expected parameter is not finite, a free one is out of its bounds, or
+            poses are not those of the rigs.
     """
 
     model_ids: Int32[np.ndarray, " C"]
@@ -99,6 +62,8 @@ class BundleProblem(Value):
     free_params: Bool[np.ndarray, "C K"]
     free_poses: Bool[np.ndarray, " I"]
     free_points: Bool[np.ndarray, " P"]
+    lower_params: Float64[np.ndarray, "C K"] | None = None
+    upper_params: Float64[np.ndarray, "C K"] | None = None
     prior_params: Float64[np.ndarray, "C K"] | None = None
     prior_sigmas: Float64[np.ndarray, "C K"] | None = None
     obs_sigmas: Float64[np.ndarray, " n"] | None = None
@@ -123,7 +88,7 @@ class BundleProblem(Value):
             object.__setattr__(self, name, readonly(getattr(self, name), shape, dtype))
         if (self.prior_params is None) != (self.prior_sigmas is None):
             raise ValueError("prior_params and prior_sigmas go together")
-        for name in ("prior_params", "prior_sigmas"):
+        for name in ("prior_params", "prior_sigmas", "lower_params", "upper_params"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, readonly(getattr(self, name), (cameras, MAX_PARAMS)))
         self._check_params()
@@ -136,9 +101,9 @@ class BundleProblem(Value):
         if self.rigs is not None:
             self._check_rigs(self.rigs)
         check_rows(self.priors, images, points)
-        _check_rows("image_cameras", self.image_cameras, cameras)
-        _check_rows("obs_images", self.obs_images, images)
-        _check_rows("obs_points", self.obs_points, points)
+        check_in_range("image_cameras", self.image_cameras, cameras)
+        check_in_range("obs_images", self.obs_images, images)
+        check_in_range("obs_points", self.obs_points, points)
 
     @property
     def pose_priors(self) -> tuple[Prior, ...]:
@@ -153,6 +118,25 @@ class BundleProblem(Value):
         return tuple(where_finite(prior, *finite) for prior in self.priors if isinstance(prior, PointPrior))
 
     @property
+    def param_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """(C, K) the least and the largest value of each parameter."""
+        lower, upper = np.full(self.camera_params.shape, -np.inf), np.full(self.camera_params.shape, np.inf)
+        return (
+            lower if self.lower_params is None else self.lower_params,
+            upper if self.upper_params is None else self.upper_params,
+        )
+
+    @property
+    def at_bounds(self) -> BoolArray:
+        """(C, K) which free parameters are on one of their bounds."""
+        lower, upper = self.param_bounds
+        return self.free_params & ((self.camera_params <= lower) | (self.camera_params >= upper))
+
+    def param_name(self, camera: int, column: int) -> str:
+        """What the model calls the parameter in a column of a camera."""
+        return model_by_id(int(self.model_ids[camera])).param_names[column]
+
+    @property
     def _finite(self) -> tuple[BoolArray, BoolArray]:
         """Which poses (I,) and points (P,) are finite; quaternions always are."""
         translations = self.cams_from_world.translation
@@ -163,6 +147,14 @@ class BundleProblem(Value):
             model = model_by_id(int(number))
             if self.free_params[self.model_ids == number, len(model.param_names) :].any():
                 raise ValueError(f"free_params must be False behind the {len(model.param_names)} of {model.name}")
+        lower, upper = self.param_bounds
+        bounded = self.free_params & ~(np.isneginf(lower) & np.isposinf(upper))
+        outside = bounded & ~((lower <= self.camera_params) & (self.camera_params <= upper))
+        for c, k in np.argwhere(outside)[:1].tolist():
+            raise ValueError(
+                f"{self.param_name(c, k)} of camera {c} is {self.camera_params[c, k]:g}, "
+                f"out of its bounds {lower[c, k]:g}..{upper[c, k]:g}"
+            )
         if self.prior_params is None or self.prior_sigmas is None:
             return
         if not np.all(self.prior_sigmas > 0):
@@ -176,11 +168,6 @@ class BundleProblem(Value):
         ours, theirs = self.cams_from_world, rigs.cams_from_world
         if not np.allclose(ours.matrix, theirs.matrix, rtol=1e-6, atol=1e-6, equal_nan=True):
             raise ValueError("cams_from_world must be the poses of the rigs' sensors")
-
-
-def _check_rows(name: str, rows: np.ndarray, count: int) -> None:
-    if len(rows) and not (rows.min() >= 0 and rows.max() < count):
-        raise ValueError(f"{name} must lie in 0..{count - 1}, got {rows.min()}..{rows.max()}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,13 +187,15 @@ class BundleConfig:
     relative_cost_tolerance: float = 1e-6
     """Stop where a full step lowers the cost by less than this part."""
     gradient_tolerance: float = 1e-10
-    """Stop where no entry of the gradient exceeds this; px² per radian, scene unit or camera parameter."""
+    """Stop where the residuals are as good as perpendicular to what any parameter does to them: where the cosine of no
+    such angle, |g| / √(2 F H) of a gradient and a diagonal entry, exceeds this. Without a unit."""
     gauge: Literal["two_cameras", "three_points", "free"] = "two_cameras"
     """Where the data leave the frame of the scene open: keep one pose and one coordinate of a second centre as they
     were, or two points and the plane through them and a third, or leave the scene wherever the steps took it.
     Covariances are relative to these, or spread over all."""
     solver: SolverChoice = "auto"
-    """How the reduced system is solved: by a dense or a sparse factor, or by conjugate gradients; see `reduced`."""
+    """How the reduced system is solved: by a dense or a sparse factor, the faster of these (exact), a sparse one of
+    CHOLMOD, where scikit-sparse is installed, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
         if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
@@ -242,6 +231,11 @@ class BundleResult(Value):
     lost: int
     table: tuple[Iteration, ...]
     biases: FloatArray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
+
+    @property
+    def at_bounds(self) -> tuple[tuple[int, str], ...]:
+        """Camera row and name of the parameters that ended on a bound."""
+        return tuple((c, self.problem.param_name(c, k)) for c, k in np.argwhere(self.problem.at_bounds).tolist())
 
     @property
     def iterations(self) -> int:

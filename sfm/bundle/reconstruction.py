@@ -9,7 +9,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from sfm.bundle.adjustment import squared_errors
-from sfm.bundle.problem import BundleProblem, RigArrays
+from sfm.bundle.problem import BundleProblem
+from sfm.bundle.rig_arrays import RigArrays
 from sfm.core.arrays import BoolArray
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.camera import Camera
@@ -21,7 +22,7 @@ Intrinsics: TypeAlias = Literal["focal", "principal_point", "extra"]
 
 
 def free_params_of(model: CameraModel, refine: Collection[Intrinsics]) -> BoolArray:
-    """(12,) which parameters of a model are of the kinds named; `extra` is the distortion."""
+    """(K,) which parameters of a model are of the kinds named; `extra` is the distortion."""
     free = np.zeros(MAX_PARAMS, bool)
     for kind, indices in (
         ("focal", model.focal_indices),

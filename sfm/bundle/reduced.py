@@ -2,6 +2,7 @@
 
     dense       Cholesky factor of all of S
     sparse      Cholesky factor of the blocks that points couple, in an order that keeps it sparse
+    cholmod     the same by CHOLMOD, where it is installed
     iterative   conjugate gradients; S is known by its products alone (`schur.multiply`), and only what the
                 preconditioner needs of it is formed: the blocks of pairs of rows within clusters
 
@@ -20,15 +21,26 @@ import numpy as np
 
 from sfm.bundle import _layout_kernels as kernels
 from sfm.bundle.layout import Layout
+from sfm.bundle.marginals import Marginals, marginals
 from sfm.bundle.problem import SolverChoice
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import Workers, machine_bytes
 from sfm.core.optim._block_kernels import WIDTH
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.box import Box, step_in_box
+from sfm.core.optim.cholmod import CholmodCholesky
 from sfm.core.optim.conjugate_gradients import conjugate_gradients
 from sfm.core.optim.preconditioners import clusters_of, restricted_pattern
 from sfm.core.optim.schur import Couplings, eliminate, multiply
-from sfm.core.optim.solvers import Forecast, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
+from sfm.core.optim.solvers import (
+    Forecast,
+    forecast_cheapest,
+    forecast_cholmod,
+    forecast_dense,
+    forecast_sparse,
+    make_solver,
+)
+from sfm.core.optional import import_cholmod
 
 _FLOOR = 1e-8
 """Part of the largest diagonal entry of its kind below which an entry of D counts as this part."""
@@ -46,7 +58,7 @@ class SolverPlan(NamedTuple):
     """What was chosen to solve the reduced system, before any of its memory is taken.
 
     Attributes:
-        kind: dense, sparse or iterative.
+        kind: dense, sparse, cholmod or iterative.
         pattern: the blocks of S that are formed; forecast: of what factors them.
         bytes: for S and its factor.
     """
@@ -60,7 +72,7 @@ class SolverPlan(NamedTuple):
 def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: SolverChoice) -> SolverPlan:
     """Chooses a solver for the rows of `layout`, of whose unknowns (rows, 6) some are `held`."""
     unknowns = held.ravel()
-    if layout.rows <= _FULL_ROWS and choice in ("auto", "dense"):
+    if layout.rows <= _FULL_ROWS and choice in ("auto", "dense", "exact"):
         return _plan("dense", BlockPattern.full(layout.rows), forecast_dense(unknowns))
     pattern = layout.pattern(terms.rows, terms.columns)
     match choice:
@@ -68,10 +80,15 @@ def plan_solver(layout: Layout, held: BoolArray, terms: RowTerms, choice: Solver
             return _plan("dense", pattern, forecast_dense(unknowns))
         case "sparse":
             return _plan("sparse", pattern, forecast_sparse(pattern, unknowns))
+        case "cholmod":
+            import_cholmod()  # fails here rather than after a forecast
+            return _plan("cholmod", pattern, forecast_cholmod(pattern, unknowns))
         case "iterative":
             return _iterative(layout, pattern, unknowns)
     forecast = forecast_cheapest(pattern, unknowns)
     plan = _plan(forecast.kind, pattern, forecast)
+    if choice == "exact":
+        return plan
     too_slow = forecast.seconds > _PRODUCTS_PER_STEP * _product_seconds(layout)
     return _iterative(layout, pattern, unknowns) if too_slow or plan.bytes > machine_bytes() / 2 else plan
 
@@ -106,6 +123,20 @@ def _product_seconds(layout: Layout) -> float:
     return _PRODUCT_SECONDS_PER_COUPLING * (len(layout.slot) + 3 * len(layout.shared_slot))
 
 
+class ReducedStep(NamedTuple):
+    """A step of poses and shared parameters.
+
+    Attributes:
+        delta: (rows, 6).
+        sides: (K,) on which side of a box its entries are; see `sfm.core.optim.box`.
+        decrease: what the model promises beyond ½ δᵀ (λD δ − g), which holds where a box does not bound the step.
+    """
+
+    delta: FloatArray
+    sides: np.ndarray
+    decrease: float
+
+
 class ReducedSystem:
     """S, its right-hand side and the solver; lives as long as one adjustment.
 
@@ -119,7 +150,7 @@ class ReducedSystem:
     ) -> None:
         self.plan, self._layout, self._held, self._couplings, self._workers = plan, layout, held, couplings, workers
         self._blocks = np.zeros((len(plan.pattern.columns), BLOCK, WIDTH))
-        self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, BLOCK))
+        self._side, self._diagonal = np.zeros((layout.rows, WIDTH)), np.zeros((layout.rows, WIDTH))
         self._solver = make_solver(plan.pattern, held.ravel(), plan.forecast)
         self._own = _OwnBlocks(layout, terms, plan.pattern)
         self._narrow = layout.is_narrow
@@ -146,35 +177,58 @@ class ReducedSystem:
         self._blocks.fill(0)
         self._own.add(self._blocks)
         self._side[:, :BLOCK] = -self._own_gradient
-        self._diagonal[:] = self._own.diagonal
+        self._diagonal[:, :BLOCK] = self._own.diagonal
 
         self._gradient_of_points = g
         self._workers.map(self._eliminate_rows, self._ranges)
 
-    def solve(self, damping: float) -> FloatArray | None:
-        """δ (rows, 6) with (S + λD) δ = side; None where S + λD is not positive definite or δ not finite."""
+    @property
+    def diagonal(self) -> FloatArray:
+        """(rows, 6) of the normal matrix, as last eliminated."""
+        return self._diagonal[:, :BLOCK]
+
+    def solve(self, damping: float, box: Box | None = None) -> ReducedStep | None:
+        """δ (rows, 6) with (S + λD) δ = side, in a box the best; None where S + λD is not positive definite or δ not
+        finite."""
         self.scaling = damping * self._marquardt_diagonal()
         if not self._solver.factor(self._blocks[:, :, :BLOCK], self.scaling.ravel(), self._workers.threads):
             return None
         side = np.where(self._held, 0.0, self._side[:, :BLOCK]).ravel()
-        if self.plan.kind == "iterative":
-            found = conjugate_gradients(
-                self._multiplied, side, self._solver.solve, model_tolerance=_MODEL_TOLERANCE,
-                residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
-            )  # fmt: skip
-            delta = found.x if found.iterations or not side.any() else np.full(len(side), np.nan)
-        else:
-            delta = self._solver.solve(side)
-        return delta.reshape(-1, BLOCK) if np.isfinite(delta).all() else None
+        # What follows from a rough solution for a box is no minimum of the model in any space.
+        delta = self._solved(side, _MODEL_TOLERANCE if box is None else 0.0)
+        if not np.isfinite(delta).all():
+            return None
+        if box is None:
+            return ReducedStep(delta.reshape(-1, BLOCK), np.zeros(0, np.int64), 0.0)
+        step = step_in_box(delta, self._inverse_column, box)
+        if not np.isfinite(step.x).all():
+            return None
+        decrease = -0.5 * float((step.multipliers * step.x[box.entries]).sum())
+        return ReducedStep(step.x.reshape(-1, BLOCK), step.sides, decrease)
 
-    def matrix(self) -> FloatArray:
-        """S (6 rows, 6 rows) in full; where it is formed, all of its blocks."""
-        pattern, size = self.plan.pattern, self._layout.rows
-        S = np.zeros((size, size, BLOCK, BLOCK))
-        rows = np.repeat(np.arange(size), np.diff(pattern.offsets))
-        S[rows, pattern.columns] = self._blocks[:, :, :BLOCK]
-        lower = np.tril(S.transpose(0, 2, 1, 3).reshape(BLOCK * size, BLOCK * size))
-        return lower + np.tril(lower, -1).T
+    def _solved(self, side: FloatArray, model_tolerance: float) -> FloatArray:
+        """(6 rows,) with the factor, or by gradients; NaN where these get nowhere."""
+        if self.plan.kind != "iterative":
+            return self._solver.solve(side)
+        found = conjugate_gradients(
+            self._multiplied, side, self._solver.solve, model_tolerance=model_tolerance,
+            residual_tolerance=_RESIDUAL_TOLERANCE, max_iterations=_MAX_GRADIENTS,
+        )  # fmt: skip
+        return found.x if found.iterations or not side.any() else np.full(len(side), np.nan)
+
+    def _inverse_column(self, entry: int) -> FloatArray:
+        """That of (S + λD)⁻¹."""
+        side = np.zeros(self._held.size)
+        side[entry] = 1.0
+        return self._solved(side, 0.0)
+
+    def inverse(self, motions: FloatArray) -> Marginals | int:
+        """Blocks of S⁻¹ as last eliminated, all of them formed; see `marginals`. Overwrites S."""
+        solver = self._solver
+        if self.plan.kind == "iterative" or isinstance(solver, CholmodCholesky):
+            raise ValueError(f"an inverse needs a dense or a sparse factor of S, not {self.plan.kind}")
+        free, blocks = ~self._held.ravel(), self._blocks[:, :, :BLOCK].copy()
+        return marginals(self.plan.pattern, blocks, solver, free, motions, self._workers.threads)
 
     def _eliminate_rows(self, rows: tuple[int, int]) -> None:
         pattern = self.plan.pattern
@@ -199,12 +253,13 @@ class ReducedSystem:
 
     def _marquardt_diagonal(self) -> FloatArray:
         """The diagonal of the normal matrix (rows, 6); tiny entries become a part of the largest of their kind."""
-        raised, poses = np.empty_like(self._diagonal), len(self._layout.slot_frame)
+        diagonal, poses = self._diagonal[:, :BLOCK], len(self._layout.slot_frame)
+        raised = np.empty_like(diagonal)
         cameras = poses + int(np.sum(self._layout.shared.camera >= 0))
         sensors = cameras + int(np.sum(self._layout.shared.sensor >= 0))
         for part in (slice(None, poses), slice(poses, cameras), slice(cameras, sensors), slice(sensors, None)):
-            largest = self._diagonal[part].max(axis=0, initial=0.0)
-            np.maximum(self._diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
+            largest = diagonal[part].max(axis=0, initial=0.0)
+            np.maximum(diagonal[part], np.where(largest > 0, _FLOOR * largest, 1.0), out=raised[part])
         return raised
 
 

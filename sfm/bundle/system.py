@@ -24,18 +24,21 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm.bundle import _kernels as kernels
+from sfm.bundle.bounds import ParamBounds
 from sfm.bundle.gauge import HeldPoints
 from sfm.bundle.knowledge import Knowledge
 from sfm.bundle.layout import Layout
+from sfm.bundle.marginals import Marginals
 from sfm.bundle.prior_terms import bias_count
-from sfm.bundle.problem import BundleConfig, BundleProblem, RigArrays
+from sfm.bundle.problem import BundleConfig, BundleProblem
 from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
+from sfm.bundle.rig_arrays import RigArrays
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import Workers
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
-from sfm.core.optim.levenberg_marquardt import Trial
+from sfm.core.optim.levenberg_marquardt import Trial, steepness
 from sfm.core.optim.losses import Loss, loss_id
 from sfm.core.optim.schur import Couplings, invert_blocks
 
@@ -62,13 +65,14 @@ class BundleSystem:
         self._image_cameras, self._model_ids = problem.image_cameras.copy(), problem.model_ids.astype(np.int64)
         self.free_points = problem.free_points.copy()
         self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
+        self._cost, self._flat = 0.0, config.gradient_tolerance
         self._state = _State.of(problem)
         self._trial, self._places = self._state.copy(), _Places.of(layout)
 
         images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
         self.held = layout.padding
         self.held[: len(held)] |= held
-        self._known = Knowledge(problem, layout)
+        self._known, self._bounds = Knowledge(problem, layout), ParamBounds.of(problem, layout)
         plan = plan_solver(layout, self.held, self._known.targets, config.solver)
         announce(plan, _forecast_bytes(layout, plan, images, points))
         self._images = ImageSums.allocate(images, widest)
@@ -104,7 +108,7 @@ class BundleSystem:
 
     @property
     def camera_params(self) -> FloatArray:
-        """Current camera parameters (C, 12)."""
+        """Current camera parameters (C, K)."""
         return self._state.params
 
     @property
@@ -152,8 +156,10 @@ class BundleSystem:
             prior, V, g = self._known.linearize_points(now.points3D)
             cost, self._V, self._g = cost + prior, self._V + V, self._g + g
         self._reduced.take_over(sums, blocks, gradient)
-        largest = max(np.abs(self._reduced.gradient).max(initial=0.0), np.abs(self._g).max(initial=0.0))
-        return float(cost), float(largest)
+        reduced = self._bounds.projected(self._reduced.gradient, now.params)
+        largest = max(np.abs(reduced).max(initial=0.0), np.abs(self._g).max(initial=0.0))
+        self._cost = float(cost)
+        return self._cost, float(largest)
 
     def evaluate(self, loss: Loss) -> FloatArray:
         """ρ of the observations (n,) by points, at the current parameters; NaN where there is no projection."""
@@ -161,22 +167,32 @@ class BundleSystem:
         return self.costs
 
     def information(self, held: HeldPoints | None = None) -> Information:
-        """What the problem says about its parameters, as last linearised; points may be held in some directions."""
+        """What the problem says about its points, as last linearised; these may be held in some directions."""
         self._run(lambda job: invert_blocks(*job, self._V, 0.0, self._M), self.layout.point_chunks)
         if held is not None:
             for point, basis in zip(held.points, held.bases, strict=True):
                 self._M[point] = _within(self._V[point], basis)
         self._reduced.eliminate(self._row_centers(), self._state.points3D, self._M, self._g)
-        return Information(self._reduced.matrix(), self._couplings, self._row_centers(), self._V, self._M)
+        return Information(self._couplings, self._row_centers(), self._V, self._M)
+
+    def inverse(self, motions: FloatArray) -> Marginals | int:
+        """Blocks of the inverse of what `information` has left of poses and parameters; see `marginals`.
+
+        Args:
+            motions: (6 rows, m) that cost nothing.
+        """
+        return self._reduced.inverse(motions)
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves everything by the solution and evaluates the cost there."""
         self._eliminate(damping)
-        delta = self._reduced.solve(damping)
-        if delta is None:
-            return None
         lay, now, then = self.layout, self._state, self._trial
+        solved = self._reduced.solve(damping, self._bounds.room(now.params) if len(self._bounds) else None)
+        if solved is None:
+            return None
+        delta, sides, bound_decrease = solved
         now.move(delta, lay.slot_frame, self._places, self._rigs, then)
+        self._bounds.settle(then.params, sides)
         row_centers, totals = self._row_centers(), np.zeros((len(lay.point_chunks), 5))
 
         # Lambdas, since the checks of shapes in the test run would go over each annotated closure again.
@@ -196,8 +212,18 @@ class BundleSystem:
         cost += self._known.cost(then.images[0], then.images[2], then.params, then.biases, then.points3D)
         then.lost = int(lost)
         decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
+        decrease += bound_decrease
         norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
-        return Trial(float(cost), float(decrease), math.sqrt(step + _squared(delta)), math.sqrt(norm))
+        step_norm, norm = math.sqrt(step + _squared(delta)), math.sqrt(norm)
+        return Trial(float(cost), float(decrease), step_norm, norm, self._steepness())
+
+    def _steepness(self) -> float:
+        """See `levenberg_marquardt`. Points, which are many, are looked at where the rest is flat at least."""
+        gradient = self._bounds.projected(self._reduced.gradient, self._state.params)
+        of_rows = steepness(gradient, self._reduced.diagonal, self._cost)
+        if of_rows > self._flat:
+            return of_rows
+        return max(of_rows, steepness(self._g, self._V[:, [0, 3, 5]], self._cost))
 
     def accept(self) -> None:
         """Makes the last trial current."""
@@ -244,14 +270,13 @@ def _within(information: FloatArray, basis: FloatArray) -> FloatArray:
 
 
 class Information(NamedTuple):
-    """The reduced matrix (6 rows, 6 rows) without damping, and what was eliminated: see `sfm.core.optim.schur`.
+    """What was eliminated, without damping: see `sfm.core.optim.schur`.
 
     Attributes:
         centers: (S, 3) of the frames by row.
         V, M: (P, 6) information about each point alone, and its inverse.
     """
 
-    reduced: np.ndarray
     couplings: Couplings
     centers: np.ndarray
     V: np.ndarray
@@ -291,11 +316,11 @@ class _Places(NamedTuple):
     @staticmethod
     def of(layout: Layout) -> _Places:
         shared, poses = layout.shared, len(layout.slot_frame)
-        row, place = np.nonzero((shared.columns >= 0) & (shared.camera >= 0)[:, None])
+        camera, column, row, place = layout.parameters
         mounted = np.flatnonzero(shared.sensor >= 0)
         return _Places(
-            (shared.camera[row], shared.columns[row, place]),
-            BLOCK * (poses + row) + place,
+            (camera, column),
+            BLOCK * row + place,
             shared.sensor[mounted],
             poses + mounted,
             poses + np.flatnonzero(shared.bias >= 0),

@@ -7,7 +7,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import tyro
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "sfm refine scene -o scene/refined --refine focal,pp,distortion",
     "sfm refine sparse/0 -o refined --loss cauchy --loss-scale 2 --sigmas",
+    "sfm refine sparse/0 -o bounded --refine focal,distortion --bounds focal=0.9:1.1,distortion=-0.3:0.3",
     "sfm refine sparse/0 -o moved --refine none --hold points",
     "sfm refine scene -o georeferenced --gps photos",
     "sfm refine scene -o measured --positions places.csv --position-sigma 0.02 --gravity down.csv",
@@ -31,6 +32,7 @@ EXAMPLES = (
 _FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="")
 _PX = tyro.conf.arg(metavar="PX", help_behavior_hint="")
 _UNITS = tyro.conf.arg(metavar="UNITS", help_behavior_hint="")
+_Solver: TypeAlias = Literal["auto", "dense", "sparse", "cholmod", "iterative"]
 _GPS_SIGMA_M = 5.0
 _KINDS: dict[str, Intrinsics] = {"focal": "focal", "pp": "principal_point", "distortion": "extra"}
 _SENSORS = "sensors"
@@ -67,6 +69,10 @@ class RefineOptions:
     distortion_sigma: Annotated[float | None, tyro.conf.arg(metavar="S", help_behavior_hint="")] = None
     """The same of each parameter of the distortion."""
 
+    bounds: Annotated[str, tyro.conf.arg(metavar="LIST", help_behavior_hint="")] = ""
+    """How far the cameras may change, as in focal=0.8:1.2,pp=-20:20,distortion=-0.3:0.3: focal lengths by a factor,
+    principal points by px, the parameters of distortion to a value; a side may be left open."""
+
     hold: Annotated[str, tyro.conf.arg(metavar="LIST", help_behavior_hint="")] = ""
     """What else may not change: poses, points."""
 
@@ -85,8 +91,9 @@ class RefineOptions:
     tolerance: Annotated[float, tyro.conf.arg(metavar="PART")] = 1e-8
     """Stop where a full step lowers the cost by less than this part."""
 
-    solver: Annotated[Literal["auto", "dense", "sparse", "iterative"], tyro.conf.arg(metavar="NAME")] = "auto"
-    """How the reduced system is solved: dense, sparse (factors), iterative (conjugate gradients); auto: the fastest."""
+    solver: Annotated[_Solver, tyro.conf.arg(metavar="NAME")] = "auto"
+    """How the reduced system is solved: dense, sparse (factors), cholmod (a sparse factor of SuiteSparse, if
+    scikit-sparse is installed), iterative (conjugate gradients); auto: the fastest without cholmod."""
 
     positions: Annotated[Path | None, _FILE] = None
     """Where photos were taken: name,x,y,z or name,latitude,longitude,altitude; also sx,sy,sz."""
@@ -150,6 +157,7 @@ def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(RefineOptions, "refine", words, EXAMPLES)
     kinds, held = _listed(options.refine, (*_KINDS, _SENSORS), "--refine"), _listed(options.hold, _HELD, "--hold")
+    bounds = _bounds(options.bounds, kinds)
     if options.threads < 0:
         raise ConfigError(f"--threads must not be negative, got {options.threads}")
 
@@ -183,6 +191,9 @@ def main(words: Sequence[str]) -> int:
             focal_sigma=options.focal_sigma,
             principal_point_sigma=options.pp_sigma,
             distortion_sigma=options.distortion_sigma,
+            focal_bounds=bounds.get("focal"),
+            principal_point_bounds=bounds.get("pp"),
+            distortion_bounds=bounds.get("distortion"),
             sensors=_SENSORS in kinds,
             poses="poses" not in held,
             points="points" not in held,
@@ -207,6 +218,27 @@ def main(words: Sequence[str]) -> int:
         write_text(options.plot, convergence_svg(refined.result.table, f"sfm refine {options.model}"))
     print(json.dumps(refined.to_json(), indent=2) if options.json else summary(refined, options.output))
     return ExitCode.OK
+
+
+def _bounds(text: str, free: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Least and largest value by the names of the option; only what is free may be bounded."""
+    found: dict[str, tuple[float, float]] = {}
+    for part in (part.strip() for part in text.split(",") if part.strip()):
+        kind, equals, interval = part.partition("=")
+        least, colon, most = interval.partition(":")
+        try:
+            bounds = (float(least or "-inf"), float(most or "inf"))
+        except ValueError:
+            bounds = (0.0, 0.0)
+        if kind not in _KINDS or not equals or not colon or not bounds[0] < bounds[1]:
+            raise ConfigError(
+                f"--bounds does not know {part!r}",
+                remedy="write it like focal=0.8:1.2,pp=-20:20,distortion=-0.3:0.3, the least first",
+            )
+        if kind not in free:
+            raise ConfigError(f"--bounds are of {kind}, which may not change", remedy=f"name {kind} in --refine, too")
+        found[kind] = bounds
+    return found
 
 
 def _announce(event: Event) -> None:
@@ -269,7 +301,7 @@ def _listed(words: str, known: Sequence[str], option: str) -> list[str]:
 
 _REASONS = {
     "relative_cost": "a full step hardly lowered the cost",
-    "gradient": "the gradient vanished",
+    "gradient": "the gradient vanished (residuals are perpendicular to what parameters do to them)",
     "step": "steps became as small as rounding errors",
     "max_iterations": "NOT CONVERGED: the limit of iterations was reached",
     "no_free_parameters": "nothing was free to change",
@@ -296,6 +328,10 @@ def summary(refined: RefinedModel, folder: Path) -> str:
         lines.append(f"{result.invalid} observations have no projection (behind the camera) and took no part")
     if result.lost:
         lines.append(f"{result.lost} observations lost their projection on the way")
+    for camera_id, names in list(refined.at_bounds.items())[:5]:
+        lines.append(f"camera {camera_id}: {', '.join(names)} ended on a bound")
+    if len(refined.at_bounds) > 5:
+        lines.append(f"and parameters of {len(refined.at_bounds) - 5} more cameras")
     if refined.undetermined:
         lines.append(f"no standard deviations: the observations leave open {refined.undetermined}")
     for camera_id, camera in list(model.cameras.items())[:5]:

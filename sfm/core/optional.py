@@ -1,8 +1,9 @@
-"""Optional heavy dependencies: the one place that knows how to import Open3D."""
+"""Optional dependencies: the one place that knows how to import Open3D and CHOLMOD."""
 
 from __future__ import annotations
 
 import ctypes
+import importlib
 import sys
 import warnings
 from types import ModuleType
@@ -35,6 +36,26 @@ def import_open3d() -> ModuleType:
             f"Open3D cannot be imported ({error})", remedy="pip install 'parallax[dense]'"
         ) from error
     return open3d
+
+
+def import_cholmod() -> ModuleType:
+    """The module `sksparse.cholmod` of scikit-sparse 0.4; that of 0.5 has another interface.
+
+    Raises:
+        MissingDependencyError: it is not installed, or one of its libraries is missing.
+    """
+    try:
+        cholmod = importlib.import_module("sksparse.cholmod")
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"CHOLMOD cannot be imported ({error})", remedy="pip install 'scikit-sparse<0.5', which needs SuiteSparse"
+        ) from error
+    if not hasattr(cholmod, "analyze"):
+        raise MissingDependencyError(
+            "the scikit-sparse that is installed has another interface to CHOLMOD than that of 0.4",
+            remedy="pip install 'scikit-sparse<0.5'",
+        )
+    return cholmod
 
 
 def _load_libusb() -> None:

@@ -11,6 +11,7 @@ from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import DescriptorKind, PairKind, TwoViewGeometry
+from sfm.io.colmap_tables import colmap_model
 
 UNDEFINED_KIND = 0
 UNDEFINED_FEATURE = -1
@@ -21,7 +22,7 @@ _FOREIGN_KINDS = {8: PairKind.UNCALIBRATED, 9: PairKind.CALIBRATED}
 
 def camera_row(camera: Camera) -> tuple[Any, ...]:
     prior = int(camera.has_prior_focal_length)
-    return camera.model_info.model_id, camera.width, camera.height, camera.params.astype("<f8").tobytes(), prior
+    return colmap_model(camera).model_id, camera.width, camera.height, camera.params.astype("<f8").tobytes(), prior
 
 
 def array(blob: bytes | None, dtype: Any, shape: tuple[int, ...] = (-1,)) -> np.ndarray:

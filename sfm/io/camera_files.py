@@ -1,8 +1,8 @@
-"""Calibrations on disk: COLMAP's cameras.txt or .bin, and the camera file of Parallax.
+"""Calibrations on disk: COLMAP's cameras.txt or .bin, files of other programs, and the camera file of Parallax.
 
 [camera]
 name = "left"                     # optional
-model = "OPENCV"                  # a model of COLMAP
+model = "OPENCV"                  # a model of COLMAP, FULL_OPENCV_THIN_PRISM or DOUBLE_SPHERE
 width = 4000
 height = 3000
 pixel_center = 0.5                # where the centre of the first pixel is: 0.5 (default), or 0.0 as in OpenCV
@@ -25,6 +25,7 @@ from sfm.core.cameras import MODELS, Camera, model_by_name
 from sfm.core.errors import ConfigError, FormatError
 from sfm.io import colmap_binary, colmap_text
 from sfm.io.atomic import os_errors, write_text
+from sfm.io.camera_foreign import read_foreign_cameras
 from sfm.io.camera_records import TABLES, CameraRecord, record_from_document, record_lines
 
 _REQUIRED = ("model", "width", "height", "params")
@@ -50,9 +51,7 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
         case ".txt":
             cameras = colmap_text.read_cameras(path)
         case _:
-            raise FormatError(
-                "is no calibration file", path=path, remedy="name a cameras.txt or .bin of COLMAP, or a camera .toml"
-            )
+            cameras = dict(enumerate(read_foreign_cameras(path).cameras, 1))
     if not cameras:
         raise FormatError("holds no camera", path=path)
     for camera_id, camera in cameras.items():

@@ -30,7 +30,7 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import Frame, Rig
 from sfm.io import _kernels
 from sfm.io.atomic import Chunks, os_errors
-from sfm.io.colmap_tables import ImageTable, PointTable, pose_of
+from sfm.io.colmap_tables import ImageTable, PointTable, colmap_model, pose_of
 
 _POINT_HEAD = np.dtype([("point_id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 _LENGTH_AT = _POINT_HEAD.itemsize - 8
@@ -197,10 +197,14 @@ def read_points(path: Path) -> PointTable:
 
 
 def cameras_chunks(cameras: dict[int, Camera]) -> Chunks:
-    """The content of cameras.bin."""
+    """The content of cameras.bin.
+
+    Raises:
+        FormatError: COLMAP lacks the model of one.
+    """
     yield struct.pack("<Q", len(cameras))
     for camera_id, camera in cameras.items():
-        yield struct.pack("<IiQQ", camera_id, camera.model_info.model_id, camera.width, camera.height)
+        yield struct.pack("<IiQQ", camera_id, colmap_model(camera).model_id, camera.width, camera.height)
         yield camera.params.astype("<f8").tobytes()
 
 

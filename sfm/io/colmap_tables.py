@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm.core.cameras import Camera
+from sfm.core.cameras import Camera, CameraModel
 from sfm.core.errors import FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -46,6 +46,22 @@ class PointTable:
     offsets: np.ndarray
     image_ids: np.ndarray
     feature_ids: np.ndarray
+
+
+def colmap_model(camera: Camera) -> CameraModel:
+    """The model of a camera that goes into one of COLMAP's files.
+
+    Raises:
+        FormatError: COLMAP does not have it.
+    """
+    model = camera.model_info
+    if not model.is_in_colmap:
+        nearest = "OPENCV_FISHEYE" if model.is_fisheye else "FULL_OPENCV"
+        remedy = (
+            f"fit a model that it has, and see how far it is off: calib convert FILE -o cameras.txt --fit {nearest}"
+        )
+        raise FormatError(f"COLMAP has no camera model {model.name}", remedy=remedy)
+    return model
 
 
 def pose_of(numbers: Sequence[float]) -> Rigid3:

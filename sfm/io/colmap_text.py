@@ -21,7 +21,7 @@ from sfm.core.errors import FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import Frame, Rig
 from sfm.io.atomic import Chunks, os_errors
-from sfm.io.colmap_tables import ImageTable, PointTable, pose_of
+from sfm.io.colmap_tables import ImageTable, PointTable, colmap_model, pose_of
 
 Item = TypeVar("Item")
 _CAMERA = "CAMERA"
@@ -180,10 +180,15 @@ def _lines(path: Path) -> Iterator[Iterator[str]]:
 
 
 def cameras_chunks(cameras: dict[int, Camera]) -> Chunks:
-    """The content of cameras.txt."""
+    """The content of cameras.txt.
+
+    Raises:
+        FormatError: COLMAP lacks the model of one.
+    """
     yield _header("Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", len(cameras), "cameras")
     for camera_id, camera in cameras.items():
-        yield f"{camera_id} {camera.model} {camera.width} {camera.height} {_numbers(camera.params)}\n".encode()
+        words = f"{camera_id} {colmap_model(camera).name} {camera.width} {camera.height} {_numbers(camera.params)}"
+        yield f"{words}\n".encode()
 
 
 def rigs_chunks(rigs: Iterable[Rig]) -> Chunks:

@@ -28,7 +28,7 @@ def adjust_globally(
     observer: Observer,
     weighted: bool = False,
 ) -> None:
-    """Adjusts all poses and points, and the camera parameters that `free_params` (C, 12) marks.
+    """Adjusts all poses and points, and the camera parameters that `free_params` (C, K) marks.
 
     Args:
         weighted: each residual counts as much as keypoints of its scale have proved precise, see `noise`.

@@ -26,6 +26,7 @@ import numpy as np
 from sfm.bundle import BundleConfig
 from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, ImageRegistered, Note, Observer
 from sfm.core.geometry.rigid import Rigid3
@@ -36,7 +37,7 @@ from sfm.mapping.initialization import InitialPair, acceptable_pairs, rank_initi
 from sfm.mapping.joining import find_join, join_doubt, merged
 from sfm.mapping.leftovers import chance_doubt, loss_doubt, match_doubt
 from sfm.mapping.registration import Resection, next_images, resect
-from sfm.mapping.state import MAX_PARAMS, Scene, State
+from sfm.mapping.state import Scene, State
 from sfm.mapping.tracks import build_tracks
 
 
@@ -454,7 +455,7 @@ class _Mapper:
             adjust()
 
     def free_params(self, state: State, principal_points: bool) -> np.ndarray:
-        """Which parameters (C, 12) are adjusted.
+        """Which parameters (C, K) are adjusted.
 
         Two images show little of a lens: then only a guessed focal length is. The principal point, which a rotation
         imitates, is left to the end and to cameras with several images.

@@ -12,13 +12,11 @@ import numpy as np
 
 from sfm.core.arrays import FloatArray, Points2D
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import Reconstruction, Tracks
 from sfm.mapping import _kernels
-
-MAX_PARAMS = 12
-
 
 _FOCAL_SIGMA = {True: 0.2, False: 0.5}
 """Relative standard deviation of a focal length that EXIF or a file gives, and of a guessed one."""
@@ -29,7 +27,7 @@ _DISTORTION_SIGMA = 0.2
 
 
 def expected_intrinsics(cameras: tuple[Camera, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters (C, 12) as they are, and the standard deviations that adjustment holds them with.
+    """Parameters (C, K) as they are, and the standard deviations that adjustment holds them with.
 
     The priors are weak against the thousands of observations of a real model. They matter where the photos leave a
     parameter open: two views with two unknown focal lengths, a flat scene, a distortion that nothing shows.
@@ -52,7 +50,7 @@ class Scene:
     Attributes:
         image_ids, image_names, sizes: of each image row; sizes (I, 2) px.
         camera_ids, cameras, image_camera: cameras as they came, and each image's row among them.
-        expected_params, param_sigmas: (C, 12) what their parameters are expected to be, and how closely.
+        expected_params, param_sigmas: (C, K) what their parameters are expected to be, and how closely.
         offsets, image, feature, xy, scale: tracks as flat columns, `image` as rows; scales of keypoints in px, 0 where
             they are unknown.
         track_of: the track of each observation.
@@ -128,7 +126,7 @@ class Scene:
 class State:
     """Poses, intrinsics and points so far; see `_kernels` for the columns.
 
-    `model_ids` and `params` (C, 12) are the cameras, rays the unit bearings of the observations under them.
+    `model_ids` and `params` (C, K) are the cameras, rays the unit bearings of the observations under them.
     """
 
     scene: Scene

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from sfm.core.cameras import MODELS
+from sfm.core.cameras import COLMAP_MODELS
 from sfm.core.errors import ConfigError
 from sfm.features import FeatureConfig, TrackingConfig
 from sfm.mapping import MappingConfig
@@ -45,7 +45,7 @@ class CameraConfig:
     """Adjust given intrinsics too. Those that were not given are always adjusted."""
 
     def __post_init__(self) -> None:
-        names = [model.name for model in MODELS]
+        names = [model.name for model in COLMAP_MODELS]
         if self.model not in names:
             raise ConfigError(f"unknown camera model {self.model!r}", remedy=nearest(self.model, names))
         if self.sharing not in ("auto", "single", "folder", "image"):

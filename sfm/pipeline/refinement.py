@@ -15,6 +15,7 @@ from sfm.bundle import (
     BundleResult,
     adjust,
     covariance,
+    covariance_bytes,
     free_params_of,
     problem_from_reconstruction,
     squared_errors,
@@ -45,8 +46,14 @@ class RefinementConfig:
     """The same of principal points, in px."""
     distortion_sigma: float | None = None
     """The same of each parameter of a distortion."""
+    focal_bounds: tuple[float, float] | None = None
+    """Least and largest factor by which focal lengths may change; None: any."""
+    principal_point_bounds: tuple[float, float] | None = None
+    """By how many px coordinates of principal points may at least and at most change."""
+    distortion_bounds: tuple[float, float] | None = None
+    """What each parameter of a distortion may be at least and at most."""
     sensors: bool = False
-    """The poses of cameras on their rigs may change. Residuals alone move these; measurements move rigs as a whole."""
+    """The poses of cameras on their rigs may change."""
     poses: bool = True
     """Poses may change."""
     points: bool = True
@@ -65,6 +72,14 @@ class RefinementConfig:
             value = getattr(self, name)
             if value is not None and not 0 < value < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value}")
+        for name, now in (("focal_bounds", 1.0), ("principal_point_bounds", 0.0), ("distortion_bounds", None)):
+            bounds = getattr(self, name)
+            if bounds is None:
+                continue
+            if not bounds[0] < bounds[1]:
+                raise ValueError(f"{name} must rise, got {bounds[0]:g}..{bounds[1]:g}")
+            if now is not None and not bounds[0] <= now <= bounds[1]:
+                raise ValueError(f"{name} must contain {now:g}, no change; got {bounds[0]:g}..{bounds[1]:g}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -116,6 +131,8 @@ class RefinedModel:
         """Costs, iterations, and the cameras with their standard deviations."""
         result, table = self.result, [dataclasses.asdict(row) for row in self.result.table]
         missing: dict[str, Any] = {"undetermined": self.undetermined} if self.undetermined else {}
+        if self.at_bounds:
+            missing["at_bounds"] = self.at_bounds
         if self.frame is not None:
             missing["frame"] = self.frame.to_json()
         return {
@@ -128,6 +145,14 @@ class RefinedModel:
             "cameras": {str(k): self.camera_json(k) for k in self.reconstruction.cameras},
             "iterations": table,
         }
+
+    @property
+    def at_bounds(self) -> dict[str, list[str]]:
+        """Names of the parameters that ended on a bound, by the id of their camera."""
+        ids, found = list(self.reconstruction.cameras), {}
+        for row, name in self.result.at_bounds:
+            found.setdefault(str(ids[row]), []).append(name)
+        return found
 
     @property
     def undetermined(self) -> str:
@@ -185,7 +210,7 @@ def refine_model(
         reconstruction = transformed(reconstruction, there)
     problem = _problem(reconstruction, config, priors)
     if with_covariance:
-        _check_memory(6 * int(problem.free_poses.sum()) + int(problem.free_params.sum()))
+        _check_memory(covariance_bytes(problem, config.bundle))
     result = adjust(problem, config.bundle, threads=threads, observer=observer)
     if result.invalid == len(problem.obs_images):
         raise InputError("no observation of this model has a projection; there is nothing to adjust")
@@ -215,6 +240,7 @@ def _problem(model: Reconstruction, config: RefinementConfig, priors: ModelPrior
         problem, free_poses=problem.free_poses & config.poses, free_points=problem.free_points & config.points
     )
     problem = _with_known_parameters(problem, list(model.cameras.values()), config)
+    problem = _with_bounds(problem, list(model.cameras.values()), config)
     if config.pixel_sigma != 1:
         problem = dataclasses.replace(problem, obs_sigmas=np.full(len(problem.obs_images), config.pixel_sigma))
     if priors is None:
@@ -241,6 +267,28 @@ def _with_known_parameters(
     return dataclasses.replace(problem, prior_params=problem.camera_params, prior_sigmas=known)
 
 
+def _with_bounds(problem: BundleProblem, cameras: Sequence[Camera], config: RefinementConfig) -> BundleProblem:
+    """The problem with its camera parameters bounded as the config says."""
+    kinds: dict[Intrinsics, tuple[float, float] | None] = {
+        "focal": config.focal_bounds,
+        "principal_point": config.principal_point_bounds,
+        "extra": config.distortion_bounds,
+    }
+    lower, upper = np.full(problem.camera_params.shape, -np.inf), np.full(problem.camera_params.shape, np.inf)
+    for c, camera in enumerate(cameras):
+        for kind, bounds in kinds.items():
+            mine = free_params_of(camera.model_info, (kind,))
+            now = problem.camera_params[c, mine]
+            for side, bound in zip((lower, upper), bounds or (), strict=False):
+                side[c, mine] = {"focal": now * bound, "principal_point": now + bound, "extra": bound}[kind]
+    if np.all(np.isinf(lower)) and np.all(np.isinf(upper)):
+        return problem
+    try:
+        return dataclasses.replace(problem, lower_params=lower, upper_params=upper)
+    except ValueError as error:
+        raise InputError(str(error), remedy="wider --bounds, or a model within them") from error
+
+
 def _frame(
     there: Sim3,
     priors: ModelPriors,
@@ -263,8 +311,8 @@ def _rms(problem: BundleProblem) -> float:
     return float(np.sqrt(np.nanmean(squared_errors(problem))))
 
 
-def _check_memory(parameters: int) -> None:
-    needed, free = 32 * parameters**2, free_memory_bytes()
+def _check_memory(needed: int) -> None:
+    free = free_memory_bytes()
     if free is not None and needed > free:
         raise InputError(
             f"standard deviations take {needed / 1e9:.0f} GB of memory here, and {free / 1e9:.0f} GB are free",

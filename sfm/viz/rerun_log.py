@@ -1,4 +1,4 @@
-"""A model as a Rerun scene: the only module that imports rerun.
+"""A model as a Rerun scene.
 
     /                        view coordinates: x right, y down until a model is aligned; static
     world/points             coloured points; static
@@ -8,46 +8,29 @@
 
 What does not change is static, which keeps the number of chunks, and with it size and loading time, small.
 File names are never entity paths; they are stored beside the frusta as `name`.
-
-Rerun's SDK serves on all interfaces, and its viewer counts events for its makers unless told otherwise. Here a scene
-is always written to a file first, and the viewer is started on that file with `--bind 127.0.0.1`. The statistics
-are switched off by the environment: both the SDK and the viewer stay silent if `CI` is set and
-`FORCE_RERUN_ANALYTICS` is not (found in 0.41; there is no other switch but a file in the user's home). The web
-viewer has no switch and is served by ourselves (see `web_viewer`).
 """
 
 from __future__ import annotations
 
-import contextlib
-import importlib.util
-import os
-import subprocess
-import sys
-import tempfile
-import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import cv2
 import numpy as np
 
 from sfm.core.arrays import ImageU8, Points2D
 from sfm.core.cameras import Camera
-from sfm.core.errors import MissingDependencyError, SfmError
+from sfm.core.errors import SfmError
 from sfm.core.scene import Reconstruction
 from sfm.viz.figures import choose_view, default_frustum_size
+from sfm.viz.rerun_viewer import as_jpeg, present_scene
 from sfm.viz.thumbnails import thumbnail
-from sfm.viz.web_viewer import LOOPBACK, scene_server, viewer_files
 
-if TYPE_CHECKING:
-    import rerun as rr
-
-APPLICATION = "parallax"
 MAX_POINTS = 200_000
 """More points than this make the file large and the viewer slow without showing more."""
 
-_FRUSTUM_SIZE_PX, _CURRENT_SIZE_PX, _JPEG_QUALITY = 512, 1024, 80
+_FRUSTUM_SIZE_PX, _CURRENT_SIZE_PX = 512, 1024
 
 ReadImage = Callable[[str], ImageU8]
 
@@ -61,135 +44,23 @@ def log_reconstruction(
     spawn: bool = False,
     announce: Callable[[str], object] = lambda address: None,
 ) -> int:
-    """Writes the scene, and shows it if asked; returns when the viewer is closed.
+    """Writes the scene, and shows it if asked, as `present_scene` does; returns its size in bytes.
 
     Args:
         read_image: gives the photo of an image's name in the orientation of its pixels; a photo that it
             cannot give (`SfmError` or `OSError`) is left out.
-        save: file to keep the scene in, replaced if it is there; with none, it lives as long as the viewer.
-        web: in the browser, from a server on this machine that nothing else can reach.
-        spawn: in Rerun's own window.
-        announce: is told the address of the page where `web` is to be seen.
-    Returns:
-        Size of the scene in bytes.
-    Raises:
-        MissingDependencyError: rerun is not installed.
-        SfmError: the viewer cannot be started.
     """
-    with contextlib.ExitStack() as cleanup:
-        if save is None:
-            folder = cleanup.enter_context(tempfile.TemporaryDirectory(prefix="parallax_view_"))
-            save = Path(folder) / "scene.rrd"
-        write_scene(reconstruction, read_image, save)
-        size = save.stat().st_size
-        if web or spawn:
-            show_scene(save, web=web, announce=announce)
-    return size
+
+    def log(rr: Any, recording: Any) -> None:
+        _log_model(rr, recording, reconstruction)
+        for row in range(len(reconstruction.image_names)):
+            _log_image(rr, recording, reconstruction, row, read_image)
+
+    arranged = partial(_blueprint, reconstruction)
+    return present_scene(log, arranged, save=save, web=web, spawn=spawn, announce=announce)
 
 
-def write_scene(reconstruction: Reconstruction, read_image: ReadImage, path: Path) -> None:
-    """Writes the scene to an .rrd file, in one step as far as anyone who looks at `path` can tell."""
-    with _silent_environment():
-        rr = _rerun()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(f".{path.name}.partial")
-        recording = rr.RecordingStream(APPLICATION, send_properties=True)
-        try:
-            recording.save(partial, default_blueprint=_blueprint(reconstruction))
-            _log_model(rr, recording, reconstruction)
-            for row in range(len(reconstruction.image_names)):
-                _log_image(rr, recording, reconstruction, row, read_image)
-            recording.disconnect()
-            os.replace(partial, path)
-        finally:
-            recording.disconnect()
-            partial.unlink(missing_ok=True)
-
-
-def show_scene(path: Path, *, web: bool, announce: Callable[[str], object] = lambda address: None) -> None:
-    """Runs the viewer on a scene until it is closed or the user interrupts.
-
-    Args:
-        announce: is told the address of the page, if `web`.
-    Raises:
-        MissingDependencyError: rerun is not installed.
-        SfmError: the viewer ended with an error, for instance because there is no display.
-    """
-    with _silent_environment(), contextlib.suppress(KeyboardInterrupt):
-        if web:
-            _serve(path, announce)
-        else:
-            _run_viewer(viewer_command(path))
-
-
-def _serve(path: Path, announce: Callable[[str], object]) -> None:
-    with scene_server(path, viewer_files(_launcher())) as (server, address):
-        announce(address)
-        webbrowser.open(address)
-        server.serve_forever()
-
-
-def _run_viewer(command: list[str]) -> None:
-    viewer = subprocess.Popen(command)
-    try:
-        code = viewer.wait()
-    except BaseException:
-        viewer.terminate()
-        viewer.wait()
-        raise
-    if code != 0:
-        raise SfmError(
-            f"Rerun's viewer ended with exit code {code}",
-            remedy="without a display, use --web or keep the scene with --save and open it elsewhere",
-        )
-
-
-def viewer_command(path: Path) -> list[str]:
-    """The command line of Rerun's own window, bound to this machine alone."""
-    return [*_launcher(), "--bind", LOOPBACK, "--port", "auto", str(path)]
-
-
-def _launcher() -> list[str]:
-    """The program that rerun-sdk carries; not its wrapper in Python, which would outlive a signal."""
-    spec = importlib.util.find_spec("rerun_cli")
-    if spec is None or spec.origin is None:
-        raise _missing()
-    folder = Path(spec.origin).parent
-    programs = [folder / "Rerun.app/Contents/MacOS/Rerun", folder / "rerun.exe", folder / "rerun"]
-    program = next((program for program in programs if program.is_file()), None)
-    return [str(program)] if program else [sys.executable, "-m", "rerun_cli"]
-
-
-@contextlib.contextmanager
-def _silent_environment() -> Iterator[None]:
-    """Rerun's statistics are off within, here and in programs started from here."""
-    names = ("CI", "FORCE_RERUN_ANALYTICS")
-    before = {name: os.environ.get(name) for name in names}
-    os.environ["CI"] = "1"
-    os.environ.pop("FORCE_RERUN_ANALYTICS", None)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
-
-
-def _rerun() -> Any:
-    try:
-        import rerun
-    except ImportError as error:
-        raise _missing() from error
-    return rerun
-
-
-def _missing() -> MissingDependencyError:
-    return MissingDependencyError("the viewer needs rerun-sdk", remedy="pip install 'parallax[viz]'")
-
-
-def _log_model(rr: Any, recording: rr.RecordingStream, model: Reconstruction) -> None:
+def _log_model(rr: Any, recording: Any, model: Reconstruction) -> None:
     """What does not belong to one image: axes, points, a few figures."""
     recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
     step = max(1, -(-len(model.points3D) // MAX_POINTS))
@@ -216,7 +87,7 @@ def summary_markdown(model: Reconstruction) -> str:
     return "\n".join(["# Model", "", *lines, ""])
 
 
-def _log_image(rr: Any, recording: rr.RecordingStream, model: Reconstruction, row: int, read_image: ReadImage) -> None:
+def _log_image(rr: Any, recording: Any, model: Reconstruction, row: int, read_image: ReadImage) -> None:
     """The frusta of one image: its static one, and that of its moment on the timeline."""
     camera = model.cameras[int(model.image_camera_ids[row])]
     entity = f"world/cameras/{int(model.image_ids[row])}"
@@ -291,18 +162,12 @@ def _pinhole(rr: Any, camera: Camera, image_plane_distance: float) -> Any:
 
 
 def _encoded(rr: Any, picture: ImageU8 | None) -> list[Any]:
-    """The picture as JPEG, in a list; an empty one without a picture."""
-    if picture is None:
-        return []
-    bgr = picture[..., ::-1] if picture.ndim == 3 else picture
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
-    return [rr.EncodedImage(contents=data.tobytes(), media_type="image/jpeg")]
+    """The picture in a list; an empty one without a picture."""
+    return [] if picture is None else [as_jpeg(rr, picture)]
 
 
-def _blueprint(model: Reconstruction) -> Any:
+def _blueprint(model: Reconstruction, rrb: Any) -> Any:
     """The scene large on the left, the current image and the figures beside it, the timeline below."""
-    import rerun.blueprint as rrb
-
     eye = None
     if len(model.image_names):
         view = choose_view(model)

@@ -9,6 +9,7 @@ import pytest
 
 from sfm.bundle import BundleProblem
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 
 PARAMS = {
@@ -46,7 +47,7 @@ def build(
     rng.shuffle(rows)
     in_camera = poses[rows[:, 1]] @ points3D[rows[:, 0]]
     points2D, valid = camera.project(in_camera)
-    params, free = np.zeros((cameras, 12)), np.zeros((cameras, 12), bool)
+    params, free = np.zeros((cameras, MAX_PARAMS)), np.zeros((cameras, MAX_PARAMS), bool)
     params[:, : len(camera.params)] = camera.params
     free[:, list(free_params)] = True
     return BundleProblem(

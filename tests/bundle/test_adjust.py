@@ -5,11 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfm.bundle import BundleConfig, adjust, squared_errors
+from sfm.bundle import BundleConfig, BundleCovariance, adjust, covariance, squared_errors
+from sfm.bundle.problem import SolverChoice
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.events import BundleAdjusted, BundlePlanned
 from sfm.core.geometry.rigid import Rigid3
 
 TIGHT = BundleConfig(relative_cost_tolerance=1e-12, max_iterations=200)
+SPARSE: tuple[SolverChoice, ...] = ("sparse", "cholmod")
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy")
 
 
@@ -173,7 +176,7 @@ def test_one_kind_alone_can_be_adjusted(make_problem, perturbed, rng, which):
         truth,
         free_points=np.full(len(truth.points3D), which == "points"),
         free_poses=np.full(len(truth.free_poses), which == "poses"),
-        free_params=np.isin(np.arange(12), (0, 3))[None] & (which == "params"),
+        free_params=np.isin(np.arange(MAX_PARAMS), (0, 3))[None] & (which == "params"),
     )
     result = adjust(perturbed(only, rng), TIGHT)
     assert result.final_cost < 1e-12
@@ -257,3 +260,41 @@ def test_losses_that_give_up_on_outliers_find_the_truth_from_afar_if_graduated(m
     assert (found[True][~wrong] < 2).mean() > 0.97
     assert (found[True][wrong] > 2).mean() > 0.9
     assert np.median(found[False][~wrong]) > 2
+
+
+def test_cholmod_takes_the_same_steps_as_our_sparse_factor(make_problem, perturbed, rng):
+    pytest.importorskip("sksparse.cholmod")
+    problem = perturbed(make_problem(rng, images=8, points=120, noise_px=0.5, free_params=(0, 1)), rng)
+    ours, theirs = (adjust(problem, BundleConfig(solver=solver)) for solver in SPARSE)
+    assert theirs.iterations == ours.iterations
+    assert theirs.final_cost == pytest.approx(ours.final_cost, rel=1e-9)
+    found, expected = covariance(theirs.problem, BundleConfig(solver="cholmod")), covariance(ours.problem)
+    assert isinstance(found, BundleCovariance)
+    assert isinstance(expected, BundleCovariance)
+    np.testing.assert_allclose(found.params, expected.params, rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["trivial", "cauchy"])
+def test_the_gradient_stops_a_scene_in_any_units(make_problem, perturbed, rng, loss):
+    problem = perturbed(make_problem(rng, images=6, points=80, noise_px=0.5, free_params=(0, 1)), rng)
+    config = BundleConfig(loss=loss, relative_cost_tolerance=1e-30, gradient_tolerance=1e-7)
+    plain = adjust(problem, config)
+    assert plain.reason == "gradient"
+    poses, sigmas = problem.cams_from_world, np.full(len(problem.obs_images), 1e-4)
+    larger = dataclasses.replace(
+        problem, cams_from_world=Rigid3(poses.rotation, 1e3 * poses.translation), points3D=1e3 * problem.points3D
+    )
+    weighed = dataclasses.replace(problem, obs_sigmas=sigmas)
+    for other, scale in ((larger, 1.0), (weighed, 1e4)):
+        result = adjust(other, dataclasses.replace(config, loss_scale_px=scale))
+        assert result.reason == "gradient"
+        assert result.iterations == plain.iterations
+
+
+def test_the_gradient_of_points_alone_stops_too(make_problem, perturbed, rng):
+    problem = make_problem(rng, images=6, points=40, noise_px=0.5)
+    problem = dataclasses.replace(problem, free_poses=np.zeros(6, bool))
+    result = adjust(perturbed(problem, rng), BundleConfig(relative_cost_tolerance=1e-30, gradient_tolerance=1e-7))
+    assert result.reason == "gradient"
+    again = adjust(result.problem, BundleConfig(gradient_tolerance=1e-7))
+    assert (again.reason, again.iterations) == ("gradient", 0)

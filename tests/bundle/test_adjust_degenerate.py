@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.bundle import BundleConfig, adjust, squared_errors
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 
 
@@ -177,14 +178,14 @@ def test_a_point_that_would_pass_through_a_camera_does_not_stop_the_rest(make_pr
         {"obs_sigmas": np.array([1.0, np.inf])},
         {"obs_sigmas": np.ones(3)},
         {"model_ids": np.array([7], np.int32)},
-        {"free_params": np.isin(np.arange(12), (0, 4))[None]},
-        {"prior_params": np.zeros((1, 12))},
-        {"prior_params": np.zeros((1, 12)), "prior_sigmas": np.zeros((1, 12))},
-        {"prior_params": np.zeros((1, 12)), "prior_sigmas": np.full((1, 12), np.nan)},
+        {"free_params": np.isin(np.arange(MAX_PARAMS), (0, 4))[None]},
+        {"prior_params": np.zeros((1, MAX_PARAMS))},
+        {"prior_params": np.zeros((1, MAX_PARAMS)), "prior_sigmas": np.zeros((1, MAX_PARAMS))},
+        {"prior_params": np.zeros((1, MAX_PARAMS)), "prior_sigmas": np.full((1, MAX_PARAMS), np.nan)},
         {
-            "prior_params": np.full((1, 12), np.nan),
-            "prior_sigmas": np.ones((1, 12)),
-            "free_params": np.arange(12)[None] == 0,
+            "prior_params": np.full((1, MAX_PARAMS), np.nan),
+            "prior_sigmas": np.ones((1, MAX_PARAMS)),
+            "free_params": np.arange(MAX_PARAMS)[None] == 0,
         },
     ],
 )

@@ -17,6 +17,7 @@ import pytest
 from pycolmap import pyceres
 
 from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, adjust, covariance
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
 
@@ -57,7 +58,7 @@ def synthetic(
 def problem_of(reconstruction: pycolmap.Reconstruction, refine: bool) -> BundleProblem:
     cameras, images = sorted(reconstruction.cameras), sorted(reconstruction.reg_image_ids())
     points = sorted(reconstruction.points3D)
-    params, free = np.zeros((len(cameras), 12)), np.zeros((len(cameras), 12), bool)
+    params, free = np.zeros((len(cameras), MAX_PARAMS)), np.zeros((len(cameras), MAX_PARAMS), bool)
     for row, camera_id in enumerate(cameras):
         camera = reconstruction.cameras[camera_id]
         params[row, : len(camera.params)] = camera.params

@@ -14,8 +14,9 @@ import pytest
 
 from sfm.bundle import _kernels as kernels
 from sfm.bundle.layout import SENSOR_COLUMN, Layout, lay_out
-from sfm.bundle.problem import BundleProblem, RigArrays
-from sfm.core.cameras._kernels import project_with_jacobians
+from sfm.bundle.problem import BundleProblem
+from sfm.bundle.rig_arrays import RigArrays
+from sfm.core.cameras._kernels import MAX_PARAMS, project_with_jacobians
 from sfm.core.cameras._lane_kernels import LANES
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
@@ -32,10 +33,10 @@ def scene(rng: np.random.Generator, points: int = 100) -> BundleProblem:
     mounts = Rigid3.exp(np.array([[0.05, -0.1, 0.02, 0.4, 0.1, -0.2], [0.0, 0.1, 0.0, -0.3, 0.2, 0.1]]))
     image_frames, image_sensors = np.array([0, 0, 1, 1, 2, 3], np.int32), np.array([-1, 0, -1, 0, 1, -1], np.int32)
     rigs = RigArrays(image_frames, image_sensors, frames, mounts, np.array([True, False]))
-    poses, params, free = rigs.cams_from_world, np.zeros((3, 12)), np.zeros((3, 12), bool)
+    poses, params, free = rigs.cams_from_world, np.zeros((3, MAX_PARAMS)), np.zeros((3, MAX_PARAMS), bool)
     for c, name in enumerate(("FULL_OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL")):
         params[c, : len(PARAMS[name])] = PARAMS[name]
-    free[0], free[1, [0, 4]] = True, True
+    free[0, :12], free[1, [0, 4]] = True, True
     points3D = rng.uniform(-1.5, 1.5, (points, 3))
     points3D[3] = 30 * poses[0].center  # behind most
     rows = np.argwhere(rng.random((points, len(poses))) < 0.8)
@@ -91,7 +92,7 @@ class Slow:
         Q = np.zeros((2, count))
         for k in range(count):
             column = columns[k]
-            Q[:, k] = by_params[0][:, column] / sigma if column < 12 else by_sensor[:, column - SENSOR_COLUMN]
+            Q[:, k] = by_params[0][:, column] / sigma if column < MAX_PARAMS else by_sensor[:, column - SENSOR_COLUMN]
         u = X - self.frame_centers()[lay.image_frame[image]]
         return float(rho), root * e, root * A @ R, -root * A @ R @ skew(u), root * Q
 
@@ -300,7 +301,7 @@ def test_poses_turn_on_the_right_and_their_centres_go_against_the_shift(rng, ang
 
 
 def test_a_limit_is_the_square_of_the_radius_within_which_points_have_a_projection():
-    params = np.zeros((2, 12))
+    params = np.zeros((2, MAX_PARAMS))
     params[0, :4], params[1, :4] = [800, 500, 400, -0.2], [800, 500, 400, 0.1]
     limits = kernels.squared_limits(np.array([2, 2]), params)
     radii = np.linspace(0.01, 5, 5000)

@@ -14,6 +14,7 @@ import pytest
 
 from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, adjust, covariance, squared_errors
 from sfm.core.cameras import MODELS
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras.models import model_by_id
 from sfm.core.optim import evaluate_loss
 from tests.bundle.conftest import looking_inwards
@@ -28,7 +29,7 @@ def problem(request: pytest.FixtureRequest) -> BundleProblem:
     cameras = [random_camera(request.param, rng) for _ in range(2)]
     poses, points3D = looking_inwards(4, rng), rng.uniform(-2, 2, (15, 3))
     images, points = (grid.ravel() for grid in np.meshgrid(np.arange(4), np.arange(15)))
-    params = np.zeros((2, 12))
+    params = np.zeros((2, MAX_PARAMS))
     for row, camera in zip(params, cameras, strict=True):
         row[: len(camera.params)] = camera.params
     made = BundleProblem(
@@ -40,7 +41,7 @@ def problem(request: pytest.FixtureRequest) -> BundleProblem:
         obs_images=images.astype(np.int32),
         obs_points=points.astype(np.int32),
         obs_points2D=np.zeros((60, 2)),
-        free_params=np.zeros((2, 12), bool),
+        free_params=np.zeros((2, MAX_PARAMS), bool),
         free_poses=np.ones(4, bool),
         free_points=np.ones(15, bool),
         obs_sigmas=rng.uniform(0.5, 2, 60),

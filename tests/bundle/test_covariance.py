@@ -10,6 +10,7 @@ from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, adjust, co
 from sfm.bundle.gauge import held_by_three_points, held_by_two_cameras
 from sfm.bundle.layout import lay_out
 from sfm.core.cameras import MODELS, Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 
@@ -175,10 +176,10 @@ def test_the_variance_factor_finds_noise_that_was_not_stated(make_problem, rng):
 
 def test_a_prior_is_information(make_problem, rng):
     problem = make_problem(rng, images=4, points=40, free_params=(0, 1))
-    expected = np.zeros((1, 12))
+    expected = np.zeros((1, MAX_PARAMS))
     expected[:] = problem.camera_params
     for sigma in (1e-4, 1e9):
-        sigmas = np.full((1, 12), np.inf)
+        sigmas = np.full((1, MAX_PARAMS), np.inf)
         sigmas[0, :2] = sigma
         found = covariance(dataclasses.replace(problem, prior_params=expected, prior_sigmas=sigmas))
         assert isinstance(found, BundleCovariance)

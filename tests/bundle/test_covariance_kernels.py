@@ -6,6 +6,7 @@ import numpy as np
 
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.core.geometry.rotation import skew
+from sfm.core.optim.block_pattern import BlockPattern
 
 POINTS, POSES, ROWS = 20, 4, 6
 SIX = np.triu_indices(3)
@@ -28,9 +29,12 @@ def test_covariances_of_points_are_those_of_dense_matrices(rng):
     free[6] = False
     J = rng.normal(size=(6 * ROWS, 6 * ROWS))
     sigma, out = J @ J.T, np.zeros((POINTS, 3, 3))
+    full = BlockPattern.full(ROWS)
+    blocks = sigma.reshape(ROWS, 6, ROWS, 6).swapaxes(1, 2)[np.tril_indices(ROWS)]
     kernels.point_covariances(
-        free, offsets, starts, slot, np.ascontiguousarray(N[:, *SIX]), shared_starts, shared_slot, B, centers, X,
-        np.ascontiguousarray(V[:, *SIX]), np.ascontiguousarray(M[:, *SIX]), sigma, 1e6, out,
+        0, POINTS, free, offsets, starts, slot, np.ascontiguousarray(N[:, *SIX]), shared_starts, shared_slot, B,
+        centers, X, np.ascontiguousarray(V[:, *SIX]), np.ascontiguousarray(M[:, *SIX]), full.offsets, full.columns,
+        np.ascontiguousarray(blocks), 1e6, out,
     )  # fmt: skip
     for p in range(POINTS):
         if p == 6:

@@ -120,7 +120,7 @@ def wide(rng: np.random.Generator) -> BundleProblem:
     """A camera of twelve free parameters for each image: two shared rows each."""
     free = tuple(range(12))
     problem = build(rng, images=4, points=150, cameras=4, model="FULL_OPENCV", noise_px=0.3, seen=1.0, free_params=free)
-    priors = {"prior_params": problem.camera_params, "prior_sigmas": np.tile([20.0] * 4 + [0.02] * 8, (4, 1))}
+    priors = {"prior_params": problem.camera_params, "prior_sigmas": np.tile([20.0] * 4 + [0.02] * 12, (4, 1))}
     return dataclasses.replace(perturb(problem, rng, 0.002), **priors)
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from sfm.bundle import _lane_kernels as lanes
 from sfm.core.cameras import _lane_kernels as camera_lanes
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.cameras._lane_kernels import LANES
 from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.optim.losses import LOSSES, Loss, evaluate_loss, loss_id
@@ -161,8 +162,8 @@ def test_a_total_is_the_sum_of_two_products_of_rows(rng):
 def test_no_two_quantities_share_a_row():
     blocks = [
         (camera_lanes.ROWS, 0), (lanes._WORLD, 3), (lanes._OBSERVED, 2), (lanes._PRECISION, 1), (lanes.ERROR, 2),
-        (lanes.COST, 1), (lanes._ROOT, 1), (lanes.BY_POINT_IN_WORLD, 6), (lanes.OUT, 9 + 3 * 18), (lanes.BY_TURN, 6),
-        (lanes.BY_COLUMN, 2 * 18), (lanes.BY_SENSOR, 2),
+        (lanes.COST, 1), (lanes._ROOT, 1), (lanes.BY_POINT_IN_WORLD, 6), (lanes.OUT, 9 + 3 * (MAX_PARAMS + 6)),
+        (lanes.BY_TURN, 6), (lanes.BY_COLUMN, 2 * (MAX_PARAMS + 6)), (lanes.BY_SENSOR, 2),
     ]  # fmt: skip
     used = [row for first, count in blocks for row in range(first, first + count)]
     assert len(used) == len(set(used))

@@ -9,6 +9,7 @@ from sfm.bundle import BundleConfig, BundleProblem, adjust
 from sfm.bundle.motion_only import MotionConfig, MotionSystem, refine_motion
 from sfm.bundle.motion_problem import MotionProblem, motion_problem
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.epipolar import essential_from_pose, squared_tangent_sampson_errors
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -43,7 +44,7 @@ class Scene:
 
     def bundle(self, poses) -> BundleProblem:
         images, points = len(poses), len(self.points3D)
-        params = np.zeros((1, 12))
+        params = np.zeros((1, MAX_PARAMS))
         params[0, : len(self.camera.params)] = self.camera.params
         return BundleProblem(
             model_ids=np.array([self.camera.model_info.model_id], np.int32),
@@ -54,7 +55,7 @@ class Scene:
             obs_images=np.repeat(np.arange(images), points).astype(np.int32),
             obs_points=np.tile(np.arange(points), images).astype(np.int32),
             obs_points2D=np.concatenate(list(self.keypoints.values())),
-            free_params=np.zeros((1, 12), bool),
+            free_params=np.zeros((1, MAX_PARAMS), bool),
             free_poses=np.ones(images, bool),
             free_points=np.ones(points, bool),
         )

@@ -6,13 +6,12 @@ import pytest
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
+from sfm.bundle.mounted_terms import on_frames
 from sfm.bundle.prior_gauge import entries_to_hold, open_motions
 from sfm.bundle.prior_terms import (
     bias_count,
-    coupled,
     linearize_point_priors,
     linearize_priors,
-    on_frames,
     point_prior_cost,
     prior_cost,
     prior_residuals,
@@ -228,12 +227,6 @@ def test_the_bias_of_a_group_takes_what_is_common():
     assert bias_count([prior]) == 1
     cost = prior_cost([prior], np.stack([np.eye(3)] * 2), centers, biases)
     assert cost == pytest.approx(0.5 * (0.5 / 2.0) ** 2)
-
-
-def test_pairs_name_each_coupling_once(rng):
-    first, second = coupled(groups(rng), IMAGES)
-    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(2, 0), (4, 1), (5, 0), (5, 3), (6, 2)]
-    assert [len(column) for column in coupled((), IMAGES)] == [0, 0]
 
 
 def test_no_priors_cost_nothing():

@@ -7,13 +7,14 @@ from sfm.bundle import BundleConfig, BundleProblem, adjust
 from sfm.bundle.gauge import held_by_two_cameras
 from sfm.bundle.layout import lay_out
 from sfm.bundle.system import BundleSystem
+from sfm.core.cameras._kernels import MAX_PARAMS
 from tests.bundle.conftest import build
 
 CONVERGED = BundleConfig(relative_cost_tolerance=1e-12, max_iterations=200)
 
 
 def _with_prior(problem: BundleProblem, column: int, value: float, sigma: float) -> BundleProblem:
-    expected, sigmas = np.zeros((1, 12)), np.full((1, 12), np.inf)
+    expected, sigmas = np.zeros((1, MAX_PARAMS)), np.full((1, MAX_PARAMS), np.inf)
     expected[0, column], sigmas[0, column] = value, sigma
     return dataclasses.replace(problem, prior_params=expected, prior_sigmas=sigmas)
 
@@ -55,6 +56,6 @@ def test_the_gradient_of_the_prior_agrees_with_differences(rng):
 
 def test_half_a_prior_is_refused(rng):
     with pytest.raises(ValueError, match="together"):
-        dataclasses.replace(build(rng), prior_params=np.zeros((1, 12)))
+        dataclasses.replace(build(rng), prior_params=np.zeros((1, MAX_PARAMS)))
     with pytest.raises(ValueError, match="positive"):
-        dataclasses.replace(build(rng), prior_params=np.zeros((1, 12)), prior_sigmas=np.zeros((1, 12)))
+        dataclasses.replace(build(rng), prior_params=np.zeros((1, MAX_PARAMS)), prior_sigmas=np.zeros((1, MAX_PARAMS)))

@@ -9,7 +9,12 @@ import pytest
 
 from sfm.bundle import BundleConfig, BundleCovariance, BundleProblem, RigArrays, adjust, covariance
 from sfm.bundle.adjustment import system_of
+from sfm.bundle.knowledge import Knowledge
+from sfm.bundle.layout import lay_out
+from sfm.bundle.prior_terms import prior_residuals
+from sfm.bundle.priors import DistancePrior, GravityPrior, PositionPrior
 from sfm.core.cameras import Camera
+from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
@@ -31,7 +36,7 @@ def build_rig(rng, noise_px=0.3, points=60, free_sensors=False, free_params=()):
     poses, points3D = rigs.cams_from_world, rng.uniform(-1.5, 1.5, (points, 3))
     rows = np.argwhere(rng.random((points, len(poses))) < 0.7)
     points2D, valid = camera.project(poses[rows[:, 1]] @ points3D[rows[:, 0]])
-    params, free = np.zeros((1, 12)), np.zeros((1, 12), bool)
+    params, free = np.zeros((1, MAX_PARAMS)), np.zeros((1, MAX_PARAMS), bool)
     params[0, :4], free[0, list(free_params)] = camera.params, True
     return BundleProblem(
         model_ids=np.array([camera.model_info.model_id], np.int32),
@@ -172,3 +177,85 @@ def test_poses_that_are_not_those_of_the_rig_are_refused(rng):
     poses = Rigid3(problem.cams_from_world.rotation, problem.cams_from_world.translation + 0.1)
     with pytest.raises(ValueError, match="rigs"):
         dataclasses.replace(problem, cams_from_world=poses)
+
+
+def priors_of(problem, rng):
+    """Positions with a bias, gravity, distances: within a rig, by one sensor at two moments, and across."""
+    poses, down = problem.cams_from_world, np.array([0.0, 1.0, 0.0])
+    images = np.arange(len(problem.free_poses), dtype=np.int32)
+    sensors, frames = rigs_of(problem).image_sensors, rigs_of(problem).image_frames
+    same_sensor, same_rig = np.flatnonzero(sensors == 1)[:2], np.flatnonzero(frames == 2)[:2]
+    across = np.array([np.flatnonzero(sensors == 0)[0], np.flatnonzero(sensors == 1)[3]])
+    first, second = (np.array([pair[k] for pair in (same_sensor, same_rig, across)], np.int32) for k in (0, 1))
+    centers = poses.center + 0.05 * rng.normal(size=(len(images), 3))
+    return (
+        PositionPrior.of_sigmas(images, centers, 0.1, bias_sigma=0.5),
+        GravityPrior(images[::2], poses[images[::2]].rotation @ down, np.full(len(images[::2]), 0.02), down),
+        DistancePrior(first, second, np.array([0.5, 1.0, 2.0]), np.array([0.1, 0.2, 0.1])),
+    )
+
+
+def prior_residuals_of(problem, bias):
+    poses = problem.cams_from_world
+    found = [prior_residuals(prior, poses.rotation.matrix, poses.center, bias * isinstance(prior, PositionPrior))
+             for prior in problem.pose_priors]  # fmt: skip
+    return np.concatenate([*found, [bias / 0.5]]).ravel()
+
+
+def test_priors_move_sensors_and_rigs_by_their_derivatives(rng):
+    problem = disturbed(build_rig(rng, free_sensors=True), rng)
+    problem = dataclasses.replace(problem, priors=priors_of(problem, rng))
+    rows, bias = FRAMES + SENSORS, rng.normal(size=3)
+    numeric = np.empty((len(prior_residuals_of(problem, bias)), 6 * rows))
+    for column in range(6 * rows):
+        ends = []
+        for size in (1e-6, -1e-6):
+            step = np.zeros((rows, 6))
+            step.flat[column] = size
+            near = moved(problem, step[:FRAMES], step[FRAMES:-1])
+            ends.append(prior_residuals_of(near, bias + step[-1, :3]))
+        numeric[:, column] = (ends[0] - ends[1]) / 2e-6
+    layout = lay_out(problem, np.ones(len(problem.obs_images), bool))
+    known, poses = Knowledge(problem, layout), problem.cams_from_world
+    frames = rigs_of(problem).rigs_from_world.center
+    _, blocks, gradient = known.linearize(
+        poses.rotation.matrix, poses.center, frames, problem.camera_params, bias[None]
+    )  # fmt: skip
+    H = np.zeros((rows, rows, 6, 6))
+    np.add.at(H, (known.targets.rows, known.targets.columns), blocks)
+    assert np.all(known.targets.rows >= known.targets.columns)
+    H = np.tril(H.transpose(0, 2, 1, 3).reshape(6 * rows, 6 * rows))
+    H += np.tril(H, -1).T
+    expected = numeric.T @ numeric
+    scale = np.sqrt(np.diag(expected))[: 6 * rows - 3]
+    difference = (H - expected)[: 6 * rows - 3, : 6 * rows - 3] / scale / scale[:, None]
+    np.testing.assert_allclose(difference, 0, atol=1e-6)
+    pull = numeric.T @ prior_residuals_of(problem, bias)
+    np.testing.assert_allclose(gradient.ravel(), pull, rtol=0, atol=1e-6 * np.abs(pull).max())
+
+
+def test_the_minimum_of_a_rig_with_priors_is_found_quickly_and_is_stationary(rng):
+    truth = build_rig(rng, noise_px=0.3, free_sensors=True)
+    problem = disturbed(dataclasses.replace(truth, priors=priors_of(truth, rng)), rng)
+    result = adjust(problem, BundleConfig(relative_cost_tolerance=1e-12))
+    assert result.reason in ("relative_cost", "gradient")
+    assert result.iterations <= 15
+    system, _ = system_of(result.problem, BundleConfig(gauge="free"), 1)
+    system.biases[:] = result.biases
+    assert system.linearize()[0] == pytest.approx(result.final_cost, rel=1e-9)
+    for _ in range(10):
+        near = disturbed(result.problem, rng, 1e-5)
+        other, _ = system_of(near, BundleConfig(gauge="free"), 1)
+        other.biases[:] = result.biases
+        assert other.linearize()[0] >= result.final_cost * (1 - 1e-11)
+
+
+def test_positions_of_cameras_measure_their_places_on_the_rig(rng):
+    truth = build_rig(rng, noise_px=0.0, free_sensors=True)
+    centers = truth.cams_from_world.center
+    prior = PositionPrior.of_sigmas(np.arange(len(centers), dtype=np.int32), 1.5 * centers, 1e-4)
+    result = adjust(dataclasses.replace(truth, priors=(prior,)), BundleConfig(relative_cost_tolerance=1e-13))
+    before, after = (rigs_of(problem).sensors_from_rig for problem in (truth, result.problem))
+    # All is half as large again, the rig too.
+    np.testing.assert_allclose(after.translation, 1.5 * before.translation, atol=1e-4)
+    np.testing.assert_allclose(result.problem.cams_from_world.center, 1.5 * centers, atol=1e-3)

@@ -16,6 +16,7 @@ import numpy as np
 from sfm.bundle import BundleConfig, BundleCovariance, adjust, covariance
 from sfm.bundle.priors import DistancePrior, PointPrior, PositionPrior
 from tests.bundle.test_rigs import build_rig, disturbed
+from sfm.core.cameras._kernels import MAX_PARAMS
 
 rng = np.random.default_rng(0)
 truth = build_rig(rng, points=9, free_sensors=True, free_params=(0, 3))
@@ -24,7 +25,7 @@ start = dataclasses.replace(
     disturbed(truth, rng, 0.002),
     obs_sigmas=rng.uniform(0.5, 2.0, len(truth.obs_images)),
     prior_params=truth.camera_params,
-    prior_sigmas=np.full((1, 12), 0.1),
+    prior_sigmas=np.full((1, MAX_PARAMS), 0.1),
     priors=(
         PositionPrior.of_sigmas(rows, centers[:3] + 0.01, 0.02, bias_sigma=0.1),
         DistancePrior(rows[:1], rows[2:] + 6, np.ones(1) * np.linalg.norm(centers[0] - centers[8]), np.full(1, 0.01)),

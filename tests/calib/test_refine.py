@@ -18,6 +18,11 @@ from tests.calib.boards_in_space import FISHEYE, LENS, PINHOLE, flat_board, pose
 
 BOARD = flat_board()
 ALL = CalibrationConfig(lens="opencv4", reject=False)
+PRISM = Camera(
+    "FULL_OPENCV_THIN_PRISM", 1280, 960,
+    np.array([900, 905, 644, 473, -0.2, 0.05, 1e-3, -5e-4, 0.01, 0.05, 0.02, 0.004, 2e-3, -1e-3, -3e-3, 1e-3]),
+)  # fmt: skip
+SPHERES = Camera("DOUBLE_SPHERE", 1280, 960, np.array([330.0, 332, 644, 473, -0.15, 0.58]))
 
 
 def views_of(camera, rng, count=14, noise_px=0.1, board=BOARD, **how):
@@ -41,8 +46,15 @@ def refused(views, config=ALL, board=BOARD) -> Rejected:
 
 @pytest.mark.parametrize(
     ("camera", "lens"),
-    [(PINHOLE, "pinhole"), (LENS, "opencv4"), (LENS, "opencv5"), (FISHEYE, "fisheye")],
-    ids=["pinhole", "opencv4", "opencv5", "fisheye"],
+    [
+        (PINHOLE, "pinhole"),
+        (LENS, "opencv4"),
+        (LENS, "opencv5"),
+        (PRISM, "opencv12"),
+        (FISHEYE, "fisheye"),
+        (SPHERES, "double_sphere"),
+    ],
+    ids=["pinhole", "opencv4", "opencv5", "opencv12", "fisheye", "double_sphere"],
 )
 def test_without_noise_the_camera_is_the_true_one(camera, lens, rng):
     poses = poses_before(camera, 12, rng)
@@ -55,7 +67,15 @@ def test_without_noise_the_camera_is_the_true_one(camera, lens, rng):
     np.testing.assert_allclose(found.cams_from_board.translation, [p.translation for p in poses], atol=1e-8)
 
 
-@pytest.mark.parametrize(("lens", "flags"), [("opencv4", cv2.CALIB_FIX_K3), ("opencv5", 0), ("opencv8", None)])
+@pytest.mark.parametrize(
+    ("lens", "flags"),
+    [
+        ("opencv4", cv2.CALIB_FIX_K3),
+        ("opencv5", 0),
+        ("opencv8", cv2.CALIB_RATIONAL_MODEL),
+        ("opencv12", cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL),
+    ],
+)
 @pytest.mark.parametrize("seed", range(3))
 def test_the_cost_is_not_above_opencv_s(lens, flags, seed):
     rng = np.random.default_rng(seed)
@@ -67,8 +87,8 @@ def test_the_cost_is_not_above_opencv_s(lens, flags, seed):
     theirs = cv2.calibrateCamera(
         [BOARD[view.corner_ids].astype(np.float32) for view in views],
         [(view.points2D - 0.5).astype(np.float32).reshape(-1, 1, 2) for view in views],
-        (1280, 960), np.eye(3), np.zeros(8),
-        flags=cv2.CALIB_RATIONAL_MODEL if flags is None else flags,
+        (1280, 960), np.eye(3), np.zeros(12),
+        flags=flags,
         criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-12),
     )  # fmt: skip
     assert found.rms_px <= theirs[0] * (1 + 1e-5)  # both round board and corners to 24 bits, at different places

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 from pathlib import Path
 
@@ -66,6 +67,33 @@ def test_a_model_of_colmap_is_refined_to_what_ceres_makes_of_it(sfm, disturbed, 
     truth = read_model(disturbed).cameras[1].params[0] / 1.02
     assert abs(cameras["params"]["f"] - truth) < 4 * cameras["sigmas"]["f"] < 0.05 * truth
     assert "cx" not in cameras["sigmas"]
+
+
+def test_a_focal_length_that_ends_on_a_bound_is_named(sfm, disturbed, tmp_path):
+    present = read_model(disturbed).cameras[1].params[0]
+    bounds = ("--bounds", "focal=0.995:,distortion=-1:1")
+    result = sfm("refine", disturbed, "-o", "bounded", "--refine", "focal,distortion", "--sigmas", *bounds)
+    assert result.returncode == 0, result.stderr
+    assert "camera 1: f ended on a bound" in result.stdout
+    assert read_model(tmp_path / "bounded").cameras[1].params[0] == 0.995 * present
+    result = sfm("refine", disturbed, "-o", "within", "--refine", "focal", "--bounds", "focal=0.9:1.1", "--json")
+    assert "at_bounds" not in json.loads(result.stdout)
+
+
+@pytest.mark.parametrize(
+    ("bounds", "told"),
+    [
+        ("focal=1.2:0.8", "does not know 'focal=1.2:0.8'"),
+        ("focal=a:b", "does not know 'focal=a:b'"),
+        ("zoom=1:2", "does not know 'zoom=1:2'"),
+        ("focal=1.1:1.2", "must contain 1"),
+        ("pp=-5:5", "may not change"),
+        ("distortion=0.5:1", "out of its bounds 0.5..1"),
+    ],
+)
+def test_bounds_that_cannot_be_are_refused(sfm, disturbed, bounds, told):
+    result = sfm("refine", disturbed, "-o", "refused", "--refine", "focal,distortion", "--bounds", bounds)
+    assert_one_line(result, 3 if "out of" in told else 2, told)
 
 
 def test_what_is_held_stays_to_the_last_bit(disturbed):
@@ -273,3 +301,10 @@ def test_measurements_that_will_not_do_are_told(sfm, disturbed, surveyed, tmp_pa
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--marks", table), 2, "of control points")
     (tmp_path / "bad.csv").write_text("name,x,y\na,1,2\n")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", "bad.csv"), 3, "lacks z")
+
+
+def test_a_solver_that_is_not_installed_is_a_missing_dependency(sfm, disturbed):
+    if importlib.util.find_spec("sksparse"):
+        pytest.skip("scikit-sparse is installed")
+    result = sfm("refine", disturbed, "-o", "refined", "--solver", "cholmod")
+    assert_one_line(result, 6, r"CHOLMOD cannot be imported.*scikit-sparse<0\.5")

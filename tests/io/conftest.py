@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm.core.cameras import MODELS, Camera
+from sfm.core.cameras import COLMAP_MODELS, Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import Reconstruction, Tracks
 
@@ -22,7 +22,7 @@ def make_reconstruction() -> Callable[..., Reconstruction]:
         rng = np.random.default_rng(seed)
         cameras = {
             3 * k + 2: Camera(model.name, 640 + k, 480, rng.uniform(0.1, 300, len(model.param_names)))
-            for k, model in enumerate(MODELS)
+            for k, model in enumerate(COLMAP_MODELS)
         }
         image_ids = np.sort(rng.choice(1000, images, replace=False)) + 1
         counts = rng.integers(points, points + 9, images) if points else np.zeros(images, np.int64)

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from sfm.core.cameras import Camera
 from sfm.core.errors import FormatError, InputError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import Frame, Reconstruction, Rig, Tracks
@@ -262,6 +263,15 @@ def test_files_that_contradict_each_other_are_refused(tmp_path, make_reconstruct
     (tmp_path / "b" / "cameras.bin").write_bytes(bytes(8))
     with pytest.raises(FormatError, match="cameras that are absent"):
         read_model(tmp_path / "b")
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_camera_that_colmap_lacks_is_refused_and_leaves_no_file(tmp_path, make_reconstruction, text: bool) -> None:
+    model = make_reconstruction()
+    cameras = dict(model.cameras) | {2: Camera("DOUBLE_SPHERE", 640, 480, np.arange(6.0))}
+    with pytest.raises(FormatError, match=r"no camera model DOUBLE_SPHERE .* --fit OPENCV_FISHEYE"):
+        write_model(dataclasses.replace(model, cameras=cameras), tmp_path / "model", text=text)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_track_to_nowhere_is_not_written(tmp_path, make_reconstruction) -> None:

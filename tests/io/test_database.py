@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm.core.cameras import MODELS, Camera
+from sfm.core.cameras import COLMAP_MODELS, Camera
 from sfm.core.errors import FormatError, InputError, Rejected, WorkspaceLockedError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import DescriptorKind, Features, Matches, PairKind, TwoViewGeometry
@@ -79,13 +79,19 @@ def database(path: Path):
 
 def test_cameras_of_every_model_read_back(path: Path, rng: np.random.Generator) -> None:
     with Database.open(path) as database:
-        for model in MODELS:
+        for model in COLMAP_MODELS:
             params = rng.uniform(0, 999, len(model.param_names))
             camera_id = database.add_camera(Camera(model.name, 640, 480, params, bool(model.model_id % 2)))
             camera = database.cameras()[camera_id]
             assert (camera.model, camera.width, camera.height) == (model.name, 640, 480)
             assert camera.has_prior_focal_length == bool(model.model_id % 2)
             np.testing.assert_array_equal(camera.params, params)
+
+
+def test_a_camera_that_colmap_lacks_is_refused_before_anything_is_written(database: Database) -> None:
+    with pytest.raises(FormatError, match="no camera model DOUBLE_SPHERE"):
+        database.add_camera(Camera("DOUBLE_SPHERE", 10, 20, np.arange(6.0)))
+    assert list(database.cameras()) == [1]
 
 
 def test_a_camera_can_be_replaced(database: Database) -> None:

@@ -14,7 +14,7 @@ from sfm.core.errors import ExitCode, ImageError, MissingDependencyError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import Reconstruction, Tracks
-from sfm.viz import rerun_log
+from sfm.viz import rerun_log, rerun_viewer
 
 
 def two_views() -> Reconstruction:
@@ -46,7 +46,7 @@ def grey_photo(name: str) -> np.ndarray:
 
 
 def rerun_program(path: Path) -> str:
-    return rerun_log.viewer_command(path)[0]
+    return rerun_viewer.viewer_command(path)[0]
 
 
 def test_keypoints_are_coloured_by_residual() -> None:
@@ -82,7 +82,7 @@ def test_the_statistics_are_off_within_and_the_environment_is_as_before_afterwar
 ) -> None:
     monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")
     monkeypatch.delenv("CI", raising=False)
-    with rerun_log._silent_environment():
+    with rerun_viewer._silent_environment():
         assert os.environ["CI"] == "1"
         assert "FORCE_RERUN_ANALYTICS" not in os.environ
     assert os.environ["FORCE_RERUN_ANALYTICS"] == "1"
@@ -92,7 +92,7 @@ def test_the_statistics_are_off_within_and_the_environment_is_as_before_afterwar
 def test_without_rerun_the_error_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'parallax\[viz\]'") as caught:
-        rerun_log.write_scene(two_views(), grey_photo, tmp_path / "scene.rrd")
+        rerun_log.log_reconstruction(two_views(), grey_photo, save=tmp_path / "scene.rrd")
     assert caught.value.exit_code == ExitCode.MISSING_DEPENDENCY
     assert list(tmp_path.iterdir()) == []
 
@@ -111,7 +111,7 @@ def test_no_other_module_of_the_product_imports_rerun() -> None:
         for path in (root / package).rglob("*.py")
         if any(line.strip().startswith(("import rerun", "from rerun")) for line in path.read_text().splitlines())
     ]
-    assert importers == ["rerun_log.py"]
+    assert importers == ["rerun_viewer.py"]
 
 
 # What follows needs rerun itself.
@@ -160,7 +160,7 @@ def test_the_names_of_rerun_that_are_used_exist() -> None:
 
 def test_the_viewer_is_bound_to_this_machine_alone() -> None:
     pytest.importorskip("rerun_cli")
-    command = rerun_log.viewer_command(Path("scene.rrd"))
+    command = rerun_viewer.viewer_command(Path("scene.rrd"))
     assert command[command.index("--bind") + 1] == "127.0.0.1"
     assert Path(command[0]).is_file()
     assert command[-1] == "scene.rrd"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sfm.core.errors import SfmError
-from sfm.viz import rerun_log
+from sfm.viz import rerun_viewer
 from sfm.viz.web_viewer import POLICY, scene_server, viewer_files
 
 FILES = {"index.html": b"<html>", "re_viewer.js": b"js", "re_viewer_bg.wasm": b"wasm", "favicon.ico": b"ico"}
@@ -79,8 +79,8 @@ def test_a_program_that_serves_nothing_is_an_error_with_a_remedy() -> None:
 
 def test_rerun_hands_out_the_files_of_its_viewer() -> None:
     pytest.importorskip("rerun_cli")
-    with rerun_log._silent_environment():
-        files = viewer_files(rerun_log._launcher())
+    with rerun_viewer._silent_environment():
+        files = viewer_files(rerun_viewer._launcher())
     assert set(files) == set(FILES)
     assert b"re_viewer.js" in files["index.html"]
     assert b"re_viewer_bg.wasm" in files["index.html"]

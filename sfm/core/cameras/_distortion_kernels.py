@@ -2,12 +2,12 @@
 
 One family serves all models with a distortion polynomial. With s = a² + b² it maps an ideal point (a, b) to
 
-    a' = a g(s) + 2 p1 a b + p2 (s + 2 a²) + s1 s        g = N / D
-    b' = b g(s) + 2 p2 a b + p1 (s + 2 b²) + s2 s        N = 1 + k1 s + k2 s² + k3 s³ + k4 s⁴
-                                                         D = 1 + d1 s + d2 s² + d3 s³
+    a' = a g(s) + 2 p1 a b + p2 (s + 2 a²) + s1 s + s2 s²        g = N / D
+    b' = b g(s) + 2 p2 a b + p1 (s + 2 b²) + s3 s + s4 s²        N = 1 + k1 s + k2 s² + k3 s³ + k4 s⁴
+                                                                 D = 1 + d1 s + d2 s² + d3 s³
 
 where (a, b) is (x/z, y/z) for a perspective lens and θ (x, y)/ρ for a fisheye lens. The tuple `coefficients` is
-(k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2); a model without some of them passes zeros.
+(k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2, s3, s4); a model without some of them passes zeros.
 
 The radial part r ↦ r g(r²) can be inverted from the axis up to the first radius where D vanishes or where
 
@@ -15,7 +15,7 @@ The radial part r ↦ r g(r²) can be inverted from the axis up to the first rad
 
 does. A positive slope at the point alone would not tell: a polynomial may fall and rise again. Positivity on all
 of [0, s] is first tried by a bound (drop the positive terms), and only where that fails by the first root. The
-tangential terms are judged at the point, by the sign of the determinant.
+tangential and thin-prism terms are judged at the point, by the sign of the determinant.
 """
 
 from __future__ import annotations
@@ -32,19 +32,20 @@ _FAR = 1e12
 @njit(cache=True, nogil=True, error_model="numpy")
 def distort(coefficients, a, b):
     """(a', b', ∂a'/∂a, ∂a'/∂b, ∂b'/∂a, ∂b'/∂b, ok); not ok beyond the range in which the map can be inverted."""
-    k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2 = coefficients
+    k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2, s3, s4 = coefficients
     s = a * a + b * b
     denominator = 1.0 + s * (d1 + s * (d2 + s * d3))
     g = (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))) / denominator
     slope = k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * 4.0 * k4)) - g * (d1 + s * (2.0 * d2 + s * 3.0 * d3))
     twice = 2.0 * slope / denominator
     cross = twice * a * b + 2.0 * (p1 * a + p2 * b)
-    aa = g + twice * a * a + 2.0 * (p1 * b + s1 * a) + 6.0 * p2 * a
-    ab = cross + 2.0 * s1 * b
-    ba = cross + 2.0 * s2 * a
-    bb = g + twice * b * b + 2.0 * (p2 * a + s2 * b) + 6.0 * p1 * b
-    a_distorted = a * g + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a) + s1 * s
-    b_distorted = b * g + 2.0 * p2 * a * b + p1 * (s + 2.0 * b * b) + s2 * s
+    prism_a, prism_b = 2.0 * s1 + 4.0 * s2 * s, 2.0 * s3 + 4.0 * s4 * s
+    aa = g + twice * a * a + 2.0 * p1 * b + prism_a * a + 6.0 * p2 * a
+    ab = cross + prism_a * b
+    ba = cross + prism_b * a
+    bb = g + twice * b * b + 2.0 * p2 * a + prism_b * b + 6.0 * p1 * b
+    a_distorted = a * g + 2.0 * p1 * a * b + p2 * (s + 2.0 * a * a) + (s1 + s2 * s) * s
+    b_distorted = b * g + 2.0 * p2 * a * b + p1 * (s + 2.0 * b * b) + (s3 + s4 * s) * s
     ok = aa * bb - ab * ba > 0.0 and _is_monotone(coefficients, s)
     return a_distorted, b_distorted, aa, ab, ba, bb, ok
 
@@ -90,7 +91,7 @@ def radial_limit(coefficients):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_monotone(coefficients, s):
     """Whether the radial part increases all the way from the axis to the squared radius `s`."""
-    k1, k2, k3, k4, d1, d2, d3, _, _, _, _ = coefficients
+    k1, k2, k3, k4, d1, d2, d3, _, _, _, _, _, _ = coefficients
     if d1 == 0.0 and d2 == 0.0 and d3 == 0.0:
         falling = 3.0 * min(k1, 0.0) + s * (5.0 * min(k2, 0.0) + s * (7.0 * min(k3, 0.0) + s * 9.0 * min(k4, 0.0)))
         if 1.0 + s * falling > 0.0:
@@ -101,7 +102,7 @@ def _is_monotone(coefficients, s):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _squared_limit(coefficients, until):
     """The squared radius at which the radial part stops increasing; inf where that is beyond `until`."""
-    k1, k2, k3, k4, d1, d2, d3, _, _, _, _ = coefficients
+    k1, k2, k3, k4, d1, d2, d3, _, _, _, _, _, _ = coefficients
     polynomials = np.zeros((2, 8))
     for i, n in enumerate((1.0, k1, k2, k3, k4)):
         for j, d in enumerate((1.0, d1, d2, d3)):

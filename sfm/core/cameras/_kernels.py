@@ -15,16 +15,18 @@ import numpy as np
 from numba import njit
 
 from sfm.core.cameras._distortion_kernels import distort, radial_limit, undistort
+from sfm.core.cameras._double_sphere_kernels import double_spherical, double_spherical_by_shape, ray_from_double_sphere
 from sfm.core.cameras._equirectangular_kernels import longitude_latitude, ray_from_longitude_latitude
 from sfm.core.cameras._eucm_kernels import ellipsoidal, ellipsoidal_by_shape, ray_from_ellipsoidal
 from sfm.core.cameras._fisheye_kernels import equidistant, ray_from_equidistant
 
-MAX_PARAMS = 12
+MAX_PARAMS = 16
 """Length of a parameter row that holds any model."""
 
 _SIMPLE_PINHOLE, _PINHOLE, _SIMPLE_RADIAL, _RADIAL, _OPENCV, _OPENCV_FISHEYE, _FULL_OPENCV = range(7)
 _SIMPLE_RADIAL_FISHEYE, _RADIAL_FISHEYE, _THIN_PRISM_FISHEYE = 8, 9, 10
 _EUCM, _EQUIRECTANGULAR = 16, 17
+_FULL_OPENCV_THIN_PRISM, _DOUBLE_SPHERE = 10001, 10002
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -77,6 +79,10 @@ def project_point_jacobians(model_id, params, x, y, z, by_point, by_params):
         by_alpha, by_beta = ellipsoidal_by_shape(params[4], params[5], x, y, z)
         by_params[0, 4], by_params[0, 5] = -fx * a * by_alpha, -fx * a * by_beta
         by_params[1, 4], by_params[1, 5] = -fy * b * by_alpha, -fy * b * by_beta
+    elif model_id == _DOUBLE_SPHERE:
+        by_xi, by_alpha = double_spherical_by_shape(params[4], params[5], x, y, z)
+        by_params[0, 4], by_params[0, 5] = -fx * a * by_xi, -fx * a * by_alpha
+        by_params[1, 4], by_params[1, 5] = -fy * b * by_xi, -fy * b * by_alpha
     return u, v, True
 
 
@@ -91,6 +97,8 @@ def unproject_point(model_id, params, u, v):
         x, y, z, ok = ray_from_equidistant(a, b)
     elif model_id == _EUCM:
         x, y, z, ok = ray_from_ellipsoidal(params[4], params[5], a, b)
+    elif model_id == _DOUBLE_SPHERE:
+        x, y, z, ok = ray_from_double_sphere(params[4], params[5], a, b)
     elif model_id == _EQUIRECTANGULAR:
         x, y, z, ok = ray_from_longitude_latitude(a, b)
     else:
@@ -149,7 +157,7 @@ def _is_equidistant(model_id):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _is_distorted(model_id):
-    return _SIMPLE_RADIAL <= model_id <= _THIN_PRISM_FISHEYE
+    return _SIMPLE_RADIAL <= model_id <= _THIN_PRISM_FISHEYE or model_id == _FULL_OPENCV_THIN_PRISM
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -157,7 +165,11 @@ def _scale_and_offset(model_id, params):
     """(fx, fy, cx, cy, position of the first parameter behind them)."""
     if model_id == _EQUIRECTANGULAR:
         return params[0] / (2.0 * math.pi), params[1] / math.pi, 0.5 * params[0], 0.5 * params[1], 0
-    if model_id in (_PINHOLE, _THIN_PRISM_FISHEYE, _EUCM) or _OPENCV <= model_id <= _FULL_OPENCV:
+    if (
+        model_id in (_PINHOLE, _THIN_PRISM_FISHEYE, _EUCM)
+        or _OPENCV <= model_id <= _FULL_OPENCV
+        or model_id >= _FULL_OPENCV_THIN_PRISM
+    ):
         return params[0], params[1], params[2], params[3], 4
     return params[0], params[0], params[1], params[2], 3
 
@@ -169,6 +181,8 @@ def _ideal_point(model_id, params, x, y, z):
         return equidistant(x, y, z)
     if model_id == _EUCM:
         return ellipsoidal(params[4], params[5], x, y, z)
+    if model_id == _DOUBLE_SPHERE:
+        return double_spherical(params[4], params[5], x, y, z)
     if model_id == _EQUIRECTANGULAR:
         return longitude_latitude(x, y, z)
     q = 1.0 / z if z > 0.0 else math.nan
@@ -178,8 +192,8 @@ def _ideal_point(model_id, params, x, y, z):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _coefficients(model_id, params):
-    """(k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2) of the common distortion."""
-    k1 = k2 = k3 = k4 = d1 = d2 = d3 = p1 = p2 = s1 = s2 = 0.0
+    """(k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2, s3, s4) of the common distortion."""
+    k1 = k2 = k3 = k4 = d1 = d2 = d3 = p1 = p2 = s1 = s2 = s3 = s4 = 0.0
     if model_id in (_SIMPLE_RADIAL, _SIMPLE_RADIAL_FISHEYE):
         k1 = params[3]
     elif model_id in (_RADIAL, _RADIAL_FISHEYE):
@@ -188,17 +202,19 @@ def _coefficients(model_id, params):
         k1, k2, k3, k4 = params[4], params[5], params[6], params[7]
     else:
         k1, k2, p1, p2 = params[4], params[5], params[6], params[7]
-        if model_id == _FULL_OPENCV:
+        if model_id in (_FULL_OPENCV, _FULL_OPENCV_THIN_PRISM):
             k3, d1, d2, d3 = params[8], params[9], params[10], params[11]
+            if model_id == _FULL_OPENCV_THIN_PRISM:
+                s1, s2, s3, s4 = params[12], params[13], params[14], params[15]
         elif model_id == _THIN_PRISM_FISHEYE:
-            k3, k4, s1, s2 = params[8], params[9], params[10], params[11]
-    return k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2
+            k3, k4, s1, s3 = params[8], params[9], params[10], params[11]
+    return k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2, s3, s4
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_by_coefficients(model_id, coefficients, fx, fy, a, b, extra, by_params):
     """Derivatives by the distortion parameters, in the model's order."""
-    k1, k2, k3, _, d1, d2, d3, _, _, _, _ = coefficients
+    k1, k2, k3, _, d1, d2, d3, _, _, _, _, _, _ = coefficients
     s = a * a + b * b
     inverse = 1.0 / (1.0 + s * (d1 + s * (d2 + s * d3)))
     u, v = fx * a * s * inverse, fy * b * s * inverse
@@ -207,7 +223,7 @@ def _fill_by_coefficients(model_id, coefficients, fx, fy, a, b, extra, by_params
     for i in range(leading):
         by_params[0, extra + i], by_params[1, extra + i] = u, v
         u, v = u * s, v * s
-    if model_id != _OPENCV and model_id != _FULL_OPENCV and model_id != _THIN_PRISM_FISHEYE:
+    if model_id not in (_OPENCV, _FULL_OPENCV, _THIN_PRISM_FISHEYE, _FULL_OPENCV_THIN_PRISM):
         return
     by_params[0, 6], by_params[1, 6] = fx * 2.0 * a * b, fy * (s + 2.0 * b * b)
     by_params[0, 7], by_params[1, 7] = fx * (s + 2.0 * a * a), fy * 2.0 * a * b
@@ -222,3 +238,6 @@ def _fill_by_coefficients(model_id, coefficients, fx, fy, a, b, extra, by_params
     for i in range(3):
         by_params[0, 9 + i], by_params[1, 9 + i] = -g * by_params[0, 4], -g * by_params[1, 4]
         g *= s
+    if model_id == _FULL_OPENCV_THIN_PRISM:
+        by_params[0, 12], by_params[0, 13] = fx * s, fx * s * s
+        by_params[1, 14], by_params[1, 15] = fy * s, fy * s * s

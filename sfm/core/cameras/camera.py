@@ -80,7 +80,9 @@ class Camera(Value):
         limit = float(_kernels.distortion_limit(self.model_info.model_id, self.params.copy()))
         if not self.model_info.is_fisheye:
             return math.atan(limit)
-        return _eucm_max_angle(*self.params[4:]) if self.model == "EUCM" else min(limit, math.pi)
+        if self.model == "EUCM":
+            return _eucm_max_angle(*self.params[4:])
+        return _double_sphere_max_angle(*self.params[4:]) if self.model == "DOUBLE_SPHERE" else min(limit, math.pi)
 
     @property
     def max_radius(self) -> float:
@@ -145,3 +147,13 @@ def _eucm_max_angle(alpha: float, beta: float) -> float:
     """Where z = −w d: the rim of the ellipsoid (α > ½) or the ray parallel to the image plane of m = 0."""
     w = (1 - alpha) / alpha if alpha > 0.5 else alpha / (1 - alpha)
     return math.atan2(math.sqrt(max(1 - w * w, 0.0)), -w * math.sqrt(beta))
+
+
+def _double_sphere_max_angle(xi: float, alpha: float) -> float:
+    """Where cos φ = −w on the second sphere, as `_eucm_max_angle` has it; with ξ > 1, where rays touch the first."""
+    if abs(xi) > 1:
+        return math.acos(-1 / xi) if xi > 1 else 0.0
+    w = (1 - alpha) / alpha if alpha > 0.5 else alpha / (1 - alpha)
+    sine2 = max(1 - w * w, 0.0)
+    reach = math.sqrt(1 - xi * xi * sine2) - xi * w
+    return math.atan2(reach * math.sqrt(sine2), -reach * w - xi)

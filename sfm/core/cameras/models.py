@@ -1,4 +1,7 @@
-"""The table of camera models, with COLMAP's names, ids and order of parameters."""
+"""The table of camera models, with COLMAP's names, ids and order of parameters where it has them.
+
+Models that COLMAP lacks have ids from 10000 on; its own end at 17. Its files and databases cannot hold them.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ class CameraModel:
     """One row of the table.
 
     Attributes:
-        model_id: as in COLMAP's files.
+        model_id: as in COLMAP's files; from `FIRST_OWN_ID` on for a model that COLMAP lacks.
         param_names: in the order of `Camera.params`.
         focal_indices, principal_point_indices, extra_indices: positions among the parameters.
     """
@@ -19,6 +22,11 @@ class CameraModel:
     model_id: int
     param_names: tuple[str, ...]
     is_fisheye: bool = False
+
+    @property
+    def is_in_colmap(self) -> bool:
+        """Whether COLMAP has the model."""
+        return self.model_id < FIRST_OWN_ID
 
     @property
     def focal_indices(self) -> tuple[int, ...]:
@@ -37,6 +45,8 @@ class CameraModel:
         return tuple(k for k, name in enumerate(self.param_names) if k not in fixed and name not in ("w", "h"))
 
 
+FIRST_OWN_ID = 10000
+
 _F, _FXY = ("f", "cx", "cy"), ("fx", "fy", "cx", "cy")
 
 MODELS: tuple[CameraModel, ...] = (
@@ -52,7 +62,16 @@ MODELS: tuple[CameraModel, ...] = (
     CameraModel("THIN_PRISM_FISHEYE", 10, (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"), is_fisheye=True),
     CameraModel("EUCM", 16, (*_FXY, "alpha", "beta"), is_fisheye=True),
     CameraModel("EQUIRECTANGULAR", 17, ("w", "h"), is_fisheye=True),
+    CameraModel(
+        "FULL_OPENCV_THIN_PRISM",
+        10001,
+        (*_FXY, "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    ),
+    CameraModel("DOUBLE_SPHERE", 10002, (*_FXY, "xi", "alpha"), is_fisheye=True),
 )
+
+COLMAP_MODELS: tuple[CameraModel, ...] = tuple(model for model in MODELS if model.is_in_colmap)
+"""Those that COLMAP's files can hold."""
 
 _BY_NAME = {model.name: model for model in MODELS}
 _BY_ID = {model.model_id: model for model in MODELS}
@@ -70,7 +89,7 @@ def model_by_name(name: str) -> CameraModel:
 
 
 def model_by_id(model_id: int) -> CameraModel:
-    """The model with COLMAP's number `model_id`.
+    """The model with the number `model_id`, COLMAP's where it has the model.
 
     Raises:
         ValueError: Parallax does not have it.

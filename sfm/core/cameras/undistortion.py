@@ -15,7 +15,7 @@ import math
 import numpy as np
 from jaxtyping import Float32
 
-from sfm.core.arrays import Mask, Points2D, Rays
+from sfm.core.arrays import BoolArray, Mask, Points2D, Rays
 from sfm.core.cameras.camera import Camera
 
 _ROWS_AT_ONCE = 64
@@ -100,3 +100,20 @@ def _tangents(camera: Camera, pixels: np.ndarray, axis: int) -> np.ndarray:
     tangents = np.full(len(pixels), np.inf)
     tangents[front] = np.maximum(np.abs(rays[front, axis]) / rays[front, 2], 1e-9)
     return tangents
+
+
+def valid_rectangle(valid: BoolArray) -> tuple[int, int, int, int]:
+    """(left, top, right, bottom), the last two beyond it, of a rectangle in which all pixels are valid.
+
+    The side with the largest part of blank pixels gives way first, so that borders that bend alike lose alike.
+    """
+    top, left = 0, 0
+    bottom, right = valid.shape
+    while bottom > top and right > left:
+        blank = ~valid[top:bottom, left:right]
+        if not blank.any():
+            break
+        worst = int(np.argmax([blank[0].mean(), blank[-1].mean(), blank[:, 0].mean(), blank[:, -1].mean()]))
+        top, bottom = top + (worst == 0), bottom - (worst == 1)
+        left, right = left + (worst == 2), right - (worst == 3)
+    return left, top, right, bottom

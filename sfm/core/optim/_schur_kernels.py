@@ -10,7 +10,15 @@ import math
 import numba as nb
 import numpy as np
 
-from sfm.core.optim._block_kernels import WIDTH, add_combination, set_product, subtract_product, subtract_upper
+from sfm.core.optim._block_kernels import (
+    WIDTH,
+    copy_coupling,
+    couple_pose,
+    couple_shared,
+    set_coupling,
+    subtract_product,
+    subtract_upper,
+)
 
 _RELATIVE_FLOOR = 1e-8
 _PIVOT_FLOOR = 1e-15
@@ -47,17 +55,6 @@ def invert_blocks(first, last, V, damping, M):
         M[p, 3], M[p, 4], M[p, 5] = c * c + e * e, e * f, f * f
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def fill_coupling(n, u0, u1, u2, w):
-    """w = N [−[u]×, I] (3, 6) for N as (xx, xy, xz, yy, yz, zz)."""
-    w[0, 0], w[0, 1], w[0, 2] = n[2] * u1 - n[1] * u2, n[0] * u2 - n[2] * u0, n[1] * u0 - n[0] * u1
-    w[1, 0], w[1, 1], w[1, 2] = n[4] * u1 - n[3] * u2, n[1] * u2 - n[4] * u0, n[3] * u0 - n[1] * u1
-    w[2, 0], w[2, 1], w[2, 2] = n[5] * u1 - n[4] * u2, n[2] * u2 - n[5] * u0, n[4] * u0 - n[2] * u1
-    w[0, 3], w[0, 4], w[0, 5] = n[0], n[1], n[2]
-    w[1, 3], w[1, 4], w[1, 5] = n[1], n[3], n[4]
-    w[2, 3], w[2, 4], w[2, 5] = n[2], n[4], n[5]
-
-
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _by_columns(y):
     """The first six columns of a 3×8 matrix, one after the other."""
@@ -74,7 +71,7 @@ def eliminate(
 ):  # fmt: skip
     """Adds the poses' own blocks to the rows `first_row:last_row` of S and takes off what goes with the points.
 
-    Blocks that the pattern lacks are left out. `diagonal` (rows, 6) gets what the poses' own blocks have there.
+    Blocks that the pattern lacks are left out. `diagonal` gets what the poses' own blocks have there.
 
     Args:
         narrow: whether no shared row has more than three unknowns.
@@ -82,88 +79,67 @@ def eliminate(
         shared_starts, shared_slot, B: the same for shared rows, which lie behind those of poses; (G, 3, 6).
         centers: (S, 3) of the poses by row; X: (P, 3).
         M, g: inverse blocks (P, 6), zero for points that do not move, and gradients (P, 3).
-        offsets, columns: the pattern of `blocks` (·, 6, 8), rows padded; side: (rows, 8).
+        offsets, columns: the pattern of `blocks` (·, 6, 8), rows padded; side, diagonal: (rows, 8).
     """
     longest = 1
     for p in range(len(X)):
         longest = max(longest, starts[p + 1] - starts[p] + shared_starts[p + 1] - shared_starts[p])
     W, rows = np.zeros((longest, 3, WIDTH)), np.empty(longest, np.int64)
-    Y = np.empty((3, WIDTH))
+    Y, Z = np.zeros((3, WIDTH)), np.zeros((3, WIDTH))
     for p in range(len(X)):
         poses, shared = starts[p + 1] - starts[p], shared_starts[p + 1] - shared_starts[p]
         first, last = starts[p], shared_starts[p]
-        moves = M[p, 0] + M[p, 3] + M[p, 5] > 0.0
         count = poses + shared
-        if (
-            count == 0
-            or (slot[first] if poses > 0 else shared_slot[last]) >= last_row
-            or (shared_slot[last + shared - 1] if shared > 0 else slot[first + poses - 1]) < first_row
-        ):
+        if count == 0 or (shared_slot[last + shared - 1] if shared > 0 else slot[first + poses - 1]) < first_row:
             continue
-        for k in range(poses):
-            s = slot[first + k]
-            if s >= last_row:
-                count = k
-                break
-            rows[k] = s
-            u0, u1, u2 = X[p, 0] - centers[s, 0], X[p, 1] - centers[s, 1], X[p, 2] - centers[s, 2]
-            fill_coupling(N[first + k], u0, u1, u2, W[k])
-        for k in range(poses, count):
-            rows[k] = shared_slot[last + k - poses]
-            block, w = B[last + k - poses], W[k]
-            for r in range(3):
-                for c in range(6):
-                    w[r, c] = block[r, c]
         information = (M[p, 0], M[p, 1], M[p, 2], M[p, 3], M[p, 4], M[p, 5])
         gradient = (g[p, 0], g[p, 1], g[p, 2])
+        moves = M[p, 0] + M[p, 3] + M[p, 5] > 0.0
         for k in range(count):
-            i = rows[k]
-            if i < first_row or i >= last_row:
+            is_pose = k < poses
+            i = slot[first + k] if is_pose else shared_slot[last + k - poses]
+            if i >= last_row:
+                break
+            rows[k] = i
+            mine = i >= first_row
+            if is_pose:
+                u = (X[p, 0] - centers[i, 0], X[p, 1] - centers[i, 1], X[p, 2] - centers[i, 2])
+                if mine:
+                    couple_pose(W, k, Y, Z, side, diagonal, i, N, first + k, u, information, gradient)
+                else:
+                    set_coupling(W, k, N, first + k, u)
+            elif mine:
+                couple_shared(W, k, Y, side, i, B, last + k - poses, information, gradient)
+            else:
+                copy_coupling(W, k, B, last + k - poses)
+            if not mine:
                 continue
-            w = W[k]
+            begin, end = offsets[i], offsets[i + 1] - 1
             if moves:
-                set_product(Y, information, w)
-                add_combination(side[i], gradient, Y)
-                factors = _by_columns(Y)
-                # Columns ascend: the block in column j is at most as far ahead as j itself.
-                at, end = offsets[i], offsets[i + 1] - 1
+                factors, at, full = _by_columns(Y), begin, end - begin == i
                 for j in range(k):
                     wanted = rows[j]
-                    if columns[at] > wanted:
-                        continue
-                    ahead = min(at + wanted - columns[at], end)
-                    while columns[ahead] > wanted:
-                        ahead -= 1
-                    if columns[ahead] == wanted:
-                        if narrow and k >= poses:
-                            subtract_upper(blocks[ahead], factors, W[j])
-                        else:
-                            subtract_product(blocks[ahead], factors, W[j])
+                    if full:
+                        at = begin + wanted
+                    else:
+                        # Columns ascend: the block in column j is at most as far ahead as j itself.
+                        if columns[at] > wanted:
+                            continue
+                        ahead = min(at + wanted - columns[at], end)
+                        while columns[ahead] > wanted:
+                            ahead -= 1
+                        if columns[ahead] < wanted:
+                            continue
                         at = ahead
-            if k < poses:
-                u0, u1, u2 = X[p, 0] - centers[i, 0], X[p, 1] - centers[i, 1], X[p, 2] - centers[i, 2]
-                # The pose's own block is [−[u]×, I]ᵀ W: one product does for it and for what is taken off.
-                if not moves:
-                    for r in range(3):
-                        for c in range(6):
-                            Y[r, c] = 0.0
-                Y[1, 0] += u2
-                Y[2, 0] -= u1
-                Y[0, 1] -= u2
-                Y[2, 1] += u0
-                Y[0, 2] += u1
-                Y[1, 2] -= u0
-                Y[0, 3] -= 1.0
-                Y[1, 4] -= 1.0
-                Y[2, 5] -= 1.0
-                diagonal[i, 0] += u1 * w[2, 0] - u2 * w[1, 0]
-                diagonal[i, 1] += u2 * w[0, 1] - u0 * w[2, 1]
-                diagonal[i, 2] += u0 * w[1, 2] - u1 * w[0, 2]
-                diagonal[i, 3] += w[0, 3]
-                diagonal[i, 4] += w[1, 4]
-                diagonal[i, 5] += w[2, 5]
-            if moves or k < poses:
-                subtract_product(blocks[offsets[i + 1] - 1], _by_columns(Y), w)
+                    if narrow and not is_pose:
+                        subtract_upper(blocks, at, factors, W, j)
+                    else:
+                        subtract_product(blocks, at, factors, W, j)
+            if is_pose:
+                # The pose's own block is Tᵀ W: one product does for it and for what is taken off.
+                subtract_product(blocks, end, _by_columns(Z), W, k)
+            elif moves:
+                subtract_product(blocks, end, _by_columns(Y), W, k)
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})

@@ -24,7 +24,7 @@ from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import chunk_bounds, ordered_map
 from sfm.core.optim import _cholesky_kernels as kernels
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
-from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks, least_pivot_of
 
 STRIP = 8
 """Rows of a strip."""
@@ -70,6 +70,10 @@ class DenseCholesky:
         x = np.zeros(len(side))
         x[self._free] = solve_strips(self._L, side[self._free])
         return x
+
+    def least_pivot(self) -> float:
+        """The least pivot of the factor, the square of an entry on its diagonal; inf where nothing is free."""
+        return least_pivot_of(self._L, len(self._free)) if len(self._free) else float("inf")
 
     def inverse_blocks(self) -> FloatArray:
         """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""

@@ -1,11 +1,10 @@
-"""Matrices M ≈ S that are easy to solve with, for conjugate gradients.
+"""Matrices M ≈ S that are easy to solve with, for conjugate gradients: cluster Jacobi.
 
-    block Jacobi     the blocks on the diagonal of S
-    cluster Jacobi   the blocks of pairs within *clusters*, sets of rows that are strongly coupled among themselves:
-                     `SparseCholesky` on the pattern that `restricted_pattern` leaves
+Of S are kept the blocks of pairs within *clusters*, sets of rows that are strongly coupled among themselves;
+`SparseCholesky` factors the pattern that `restricted_pattern` leaves. Clusters of one row each are block Jacobi.
 
-A few terms of the power series of S⁻¹ on top of either halve the steps, but each term costs a product with S, of which
-conjugate gradients make more by themselves: on streets of 1,000 images they took twice the time.
+A few terms of the power series of S⁻¹ on top halve the steps, but each term costs a product with S, of which conjugate
+gradients make more by themselves: on streets of 1,000 images they took twice the time.
 
 Reference:
     Kushal & Agarwal, Visibility based preconditioning for bundle adjustment, CVPR 2012.
@@ -16,35 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sfm.core.arrays import BoolArray, FloatArray
+from sfm.core.arrays import FloatArray
 from sfm.core.optim import _iterative_kernels as kernels
-from sfm.core.optim.block_pattern import BLOCK, BlockPattern
-
-
-class BlockJacobi:
-    """The inverse of the blocks on the diagonal; meets `solvers.ReducedSolver`.
-
-    Args:
-        pattern: may have other blocks too, which are left out.
-        held: (6N,) unknowns that stay zero.
-    """
-
-    def __init__(self, pattern: BlockPattern, held: BoolArray) -> None:
-        self._numbers, self._held = pattern.diagonal, held
-        self._inverses = np.empty((pattern.rows, BLOCK, BLOCK))
-
-    def factor(self, blocks: FloatArray, damping: FloatArray, threads: int = 1) -> bool:
-        """Whether all blocks plus diag(damping) are finite and positive definite; if so, `solve` may follow.
-
-        Args:
-            blocks: (B, 6, 6) of the pattern; of those on the diagonal the lower triangle counts.
-            damping: (6N,).
-        """
-        return kernels.invert_rows(blocks, self._numbers, damping, self._held, self._inverses)
-
-    def solve(self, side: FloatArray) -> FloatArray:
-        """x (6N,) with M x = side, and 0 where held."""
-        return np.where(self._held, 0.0, (self._inverses @ side.reshape(-1, BLOCK, 1)).ravel())
+from sfm.core.optim.block_pattern import BlockPattern
 
 
 def clusters_of(pattern: BlockPattern, weights: FloatArray, largest: int) -> np.ndarray:

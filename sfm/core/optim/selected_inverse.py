@@ -17,11 +17,12 @@ Reference:
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import get_lapack_funcs, solve_triangular
 
 from sfm.core.arrays import FloatArray
 
 _STRIP = 8
+(_potri,) = get_lapack_funcs(("potri",), dtype=np.float64)
 
 
 def front_inverse(L: FloatArray, pivots: int, below: FloatArray) -> FloatArray:
@@ -33,10 +34,20 @@ def front_inverse(L: FloatArray, pivots: int, below: FloatArray) -> FloatArray:
         below: Z₂₂, padded likewise; (0, 0) where there are no rows below.
     """
     L11, L21 = _unpacked(L, pivots, len(below))
+    if not len(below):
+        inverse = _potri(L11.T, lower=0, overwrite_c=1)[0]
+        return np.triu(inverse) + np.triu(inverse, 1).T
     inverse = solve_triangular(L11, np.eye(len(L11)), lower=True, check_finite=False)
     Y = L21 @ inverse
     Z21 = -below @ Y
     return np.block([[inverse.T @ inverse - Y.T @ Z21, Z21.T], [Z21, below]])
+
+
+def least_pivot_of(L: FloatArray, pivots: int) -> float:
+    """The least L_jj² of so many pivots (unknowns) of a front."""
+    j = np.arange(pivots)
+    strip = j // _STRIP
+    return float(L[32 * strip * (strip + 1) + j % _STRIP + _STRIP * j].max() ** -2.0)
 
 
 def gathered_blocks(Z: FloatArray, rows: np.ndarray, columns: np.ndarray) -> FloatArray:

@@ -16,12 +16,13 @@ from typing import Literal, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from sfm.core.arrays import BoolArray, FloatArray
-from sfm.core.optim.block_pattern import BlockPattern
+from sfm.core.optim.block_pattern import BLOCK, BlockPattern
+from sfm.core.optim.cholmod import CholmodCholesky
 from sfm.core.optim.dense_cholesky import DenseCholesky, strips_size
 from sfm.core.optim.ordering import Fronts, find_fronts
 from sfm.core.optim.sparse_cholesky import SparseCholesky, sparse_bytes
 
-SolverKind: TypeAlias = Literal["dense", "sparse"]
+SolverKind: TypeAlias = Literal["dense", "sparse", "cholmod"]
 
 _ALWAYS_DENSE_UNKNOWNS = 1200
 """Up to here a dense factor takes some milliseconds, which the kernels of the other are not worth compiling for."""
@@ -48,6 +49,18 @@ class ReducedSolver(Protocol):
 
     def solve(self, side: FloatArray) -> FloatArray:
         """x (6N,) with (S + diag(damping)) x = side, and 0 where held."""
+        ...
+
+
+class FactorSolver(ReducedSolver, Protocol):
+    """A solver by an exact factor, which also tells what is in the inverse."""
+
+    def least_pivot(self) -> float:
+        """The least pivot of the factor, the square of an entry on its diagonal; inf where nothing is free."""
+        ...
+
+    def inverse_blocks(self) -> FloatArray:
+        """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""
         ...
 
 
@@ -82,6 +95,12 @@ def forecast_sparse(pattern: BlockPattern, held: BoolArray) -> Forecast:
     return Forecast("sparse", sparse_bytes(fronts), float(fronts.operations.sum()), seconds, fronts)
 
 
+def forecast_cholmod(pattern: BlockPattern, held: BoolArray) -> Forecast:
+    """About what `CholmodCholesky` takes: the fronts of our own order, and S by its entries with an index each."""
+    ours, entries = forecast_sparse(pattern, held), BLOCK * BLOCK * len(pattern.columns)
+    return Forecast("cholmod", ours.bytes + 28 * entries, ours.operations, ours.seconds)
+
+
 def forecast_cheapest(pattern: BlockPattern, held: BoolArray) -> Forecast:
     """What the fastest of the solvers takes, the dense one where they are close.
 
@@ -95,11 +114,21 @@ def forecast_cheapest(pattern: BlockPattern, held: BoolArray) -> Forecast:
     return sparse if sparse.seconds < _WORTH_SPARSE * dense.seconds else dense
 
 
-def make_solver(pattern: BlockPattern, held: BoolArray, forecast: Forecast) -> DenseCholesky | SparseCholesky:
-    """The solver of a forecast for the same pattern and held unknowns (6N,); takes its memory."""
-    if forecast.kind == "dense":
-        return DenseCholesky(pattern, held)
-    return SparseCholesky(pattern, held, forecast.fronts)
+def make_solver(
+    pattern: BlockPattern, held: BoolArray, forecast: Forecast
+) -> DenseCholesky | SparseCholesky | CholmodCholesky:
+    """The solver of a forecast for the same pattern and held unknowns (6N,); takes its memory.
+
+    Raises:
+        MissingDependencyError: that of CHOLMOD is not installed.
+    """
+    match forecast.kind:
+        case "dense":
+            return DenseCholesky(pattern, held)
+        case "sparse":
+            return SparseCholesky(pattern, held, forecast.fronts)
+        case "cholmod":
+            return CholmodCholesky(pattern, held)
 
 
 def _is_dense(pattern: BlockPattern, held: BoolArray) -> bool:

@@ -27,7 +27,7 @@ from sfm.core.optim._cholesky_kernels import PANEL, factor_panel
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.dense_cholesky import SHARE_FROM, STRIP, eliminate_panel, strip_count
 from sfm.core.optim.ordering import Fronts, find_fronts
-from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks
+from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks, least_pivot_of
 
 _JOBS = 8
 """Subtrees of about this part of the work; more would leave more fronts above them, which are done one by one."""
@@ -131,6 +131,12 @@ class SparseCholesky:
         x = np.zeros(len(side))
         x[self._free] = z
         return x
+
+    def least_pivot(self) -> float:
+        """The least pivot of the factor, the square of an entry on its diagonal; inf where nothing is free."""
+        at, pivots = self._plan.factor_at, self._plan.pivots
+        fronts = (least_pivot_of(self._L[at[f] :], int(pivots[f])) for f in range(len(pivots)))
+        return min(fronts, default=float("inf"))
 
     def inverse_blocks(self) -> FloatArray:
         """The blocks (B, 6, 6) of (S + diag(damping))⁻¹ where the pattern has one, 0 where held."""

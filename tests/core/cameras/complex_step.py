@@ -26,6 +26,11 @@ def project(model: str, params: np.ndarray, points3D: np.ndarray) -> np.ndarray:
     if model == "EUCM":
         d = np.sqrt(p["beta"] * (x * x + y * y) + z * z)
         a, b = x / (p["alpha"] * d + (1 - p["alpha"]) * z), y / (p["alpha"] * d + (1 - p["alpha"]) * z)
+    elif model == "DOUBLE_SPHERE":
+        xi, alpha = p["xi"], p["alpha"]
+        w = xi * np.sqrt(x * x + y * y + z * z) + z
+        m = alpha * np.sqrt(x * x + y * y + w * w) + (1 - alpha) * w
+        a, b = x / m, y / m
     elif model_by_name(model).is_fisheye:
         r = np.sqrt(x * x + y * y)
         a, b = _angle(r, z) / r * x, _angle(r, z) / r * y
@@ -59,14 +64,16 @@ def _angle(opposite: np.ndarray, adjacent: np.ndarray) -> np.ndarray:
 
 
 def _distorted(model: str, p: dict[str, complex], a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Radial (rational for FULL_OPENCV), tangential and thin-prism terms, as far as the model has them."""
+    """Radial (rational for FULL_OPENCV and the like), tangential and thin-prism terms, as far as the model has them."""
     s = a * a + b * b
     k1, k2, k3, k4 = (p.get(name, p.get("k", 0.0) if name == "k1" else 0.0) for name in ("k1", "k2", "k3", "k4"))
     radial = 1 + k1 * s + k2 * s**2 + k3 * s**3 + k4 * s**4
-    if model == "FULL_OPENCV":
+    if model.startswith("FULL_OPENCV"):
         radial = (1 + k1 * s + k2 * s**2 + k3 * s**3) / (1 + k4 * s + p["k5"] * s**2 + p["k6"] * s**3)
     p1, p2 = p.get("p1", 0.0), p.get("p2", 0.0)
+    prism_a = p.get("sx1", p.get("s1", 0.0)) * s + p.get("s2", 0.0) * s**2
+    prism_b = p.get("sy1", p.get("s3", 0.0)) * s + p.get("s4", 0.0) * s**2
     return (
-        a * radial + 2 * p1 * a * b + p2 * (s + 2 * a * a) + p.get("sx1", 0.0) * s,
-        b * radial + 2 * p2 * a * b + p1 * (s + 2 * b * b) + p.get("sy1", 0.0) * s,
+        a * radial + 2 * p1 * a * b + p2 * (s + 2 * a * a) + prism_a,
+        b * radial + 2 * p2 * a * b + p1 * (s + 2 * b * b) + prism_b,
     )

@@ -11,6 +11,7 @@ from sfm.core.cameras import MODELS, Camera, model_by_name
 
 # Half-widths of the uniform distributions from which parameters are drawn; distortion as lenses have it.
 _PERSPECTIVE_SPREAD = {"k": 0.25, "k1": 0.25, "k2": 0.08, "k3": 0.03, "k4": 0.1, "k5": 0.03, "k6": 0.01}
+_PERSPECTIVE_SPREAD |= {"s2": 1e-6, "s4": 1e-6}  # of the fourth power of a radius that may be 20
 _FISHEYE_SPREAD = {"k": 0.06, "k1": 0.06, "k2": 0.012, "k3": 0.004, "k4": 0.001, "sx1": 1e-3, "sy1": 1e-3}
 
 
@@ -24,6 +25,7 @@ def random_camera(model: str, rng: np.random.Generator) -> Camera:
         "f": focal, "fx": focal, "fy": focal * rng.uniform(0.97, 1.03),
         "cx": width * rng.uniform(0.45, 0.55), "cy": height * rng.uniform(0.45, 0.55),
         "w": width, "h": height, "alpha": rng.uniform(0.2, 0.8), "beta": rng.uniform(0.7, 1.3),
+        "xi": rng.uniform(-0.3, 0.6),
     }  # fmt: skip
     params = [
         values[name] if name in values else rng.uniform(-1, 1) * spread.get(name, 2e-3) for name in info.param_names

@@ -10,14 +10,21 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm.core.cameras import MODELS, Camera
+from sfm.core.cameras import COLMAP_MODELS, Camera
+from tests.core.cameras.conftest import random_camera
+
+
+@pytest.fixture(params=[(m, seed) for m in COLMAP_MODELS for seed in range(2)], ids=lambda p: f"{p[0].name}-{p[1]}")
+def camera(request: pytest.FixtureRequest) -> Camera:
+    info, seed = request.param
+    return random_camera(info.name, np.random.default_rng([seed, info.model_id]))
 
 
 def theirs(camera: Camera) -> pycolmap.Camera:
     return pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=camera.params)
 
 
-@pytest.mark.parametrize("info", MODELS, ids=lambda info: info.name)
+@pytest.mark.parametrize("info", COLMAP_MODELS, ids=lambda info: info.name)
 def test_the_table_has_their_ids_and_order(info):
     other = pycolmap.Camera(model=info.name, width=10, height=10, params=np.ones(len(info.param_names)))
     assert int(other.model) == info.model_id

@@ -65,7 +65,7 @@ def test_derivatives_stay_exact_towards_the_axis():
         if info.name == "EQUIRECTANGULAR":
             continue
         focal = [300.0, 310.0][: len(info.focal_indices)]
-        extra = [0.5, 1.1] if info.name == "EUCM" else [0.02] * len(info.extra_indices)
+        extra = {"EUCM": [0.5, 1.1], "DOUBLE_SPHERE": [0.0, 0.6]}.get(info.name, [0.02] * len(info.extra_indices))
         camera = Camera(info.name, 800, 600, np.array([*focal, 400, 300, *extra]))
         for offset in (0.0, 1e-300, 1e-160, 1e-12, 1e-10, 1e-9, 1e-7):
             point = 2.0 * np.array([[offset, -0.5 * offset, 1.0]])

@@ -6,12 +6,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm.core.cameras import MODELS
+from sfm.core.cameras import COLMAP_MODELS
 from sfm.core.cameras.priors import focal_from_35mm, focal_from_sensor, infer_camera
 from sfm.core.cameras.sensors import _SENSORS_MM, _TABLE, sensor_width_mm
 
 
-@pytest.mark.parametrize("info", MODELS, ids=lambda info: info.name)
+@pytest.mark.parametrize("info", COLMAP_MODELS, ids=lambda info: info.name)
 def test_a_guessed_camera_is_pycolmaps(info):
     ours = infer_camera(info.name, 640, 480, 500.0)
     theirs = pycolmap.Camera.create_from_model_name(0, info.name, 500.0, 640, 480)

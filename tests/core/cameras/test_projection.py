@@ -25,6 +25,10 @@ def twin_project(camera: Camera, points: np.ndarray) -> np.ndarray:
     if camera.model == "EUCM":
         m = p["alpha"] * np.sqrt(p["beta"] * rho**2 + z**2) + (1 - p["alpha"]) * z
         a, b = x / m, y / m
+    elif camera.model == "DOUBLE_SPHERE":
+        shifted = z + p["xi"] * np.linalg.norm(points, axis=1)
+        m = p["alpha"] * np.hypot(rho, shifted) + (1 - p["alpha"]) * shifted
+        a, b = x / m, y / m
     elif camera.model_info.is_fisheye:
         theta = np.arctan2(rho, z)
         a, b = theta * x / rho, theta * y / rho
@@ -33,13 +37,13 @@ def twin_project(camera: Camera, points: np.ndarray) -> np.ndarray:
     s = a**2 + b**2
     k = [p.get("k", p.get("k1", 0.0)), *(p.get(f"k{i}", 0.0) for i in range(2, 7))]
     factor = 1 + k[0] * s + k[1] * s**2 + k[2] * s**3
-    if camera.model == "FULL_OPENCV":
+    if camera.model.startswith("FULL_OPENCV"):
         factor /= 1 + k[3] * s + k[4] * s**2 + k[5] * s**3
     else:
         factor += k[3] * s**4
     p1, p2 = p.get("p1", 0.0), p.get("p2", 0.0)
-    u = a * factor + 2 * p1 * a * b + p2 * (s + 2 * a**2) + p.get("sx1", 0.0) * s
-    v = b * factor + 2 * p2 * a * b + p1 * (s + 2 * b**2) + p.get("sy1", 0.0) * s
+    u = a * factor + 2 * p1 * a * b + p2 * (s + 2 * a**2) + p.get("sx1", p.get("s1", 0.0)) * s + p.get("s2", 0.0) * s**2
+    v = b * factor + 2 * p2 * a * b + p1 * (s + 2 * b**2) + p.get("sy1", p.get("s3", 0.0)) * s + p.get("s4", 0.0) * s**2
     return np.stack([p.get("fx", p.get("f")) * u + p["cx"], p.get("fy", p.get("f")) * v + p["cy"]], axis=1)
 
 
@@ -70,14 +74,15 @@ def test_projection_inverts_unprojection_over_the_image(camera, rng):
 
 @given(
     model=st.sampled_from([m.name for m in MODELS if not m.is_fisheye]),
-    coefficients=st.lists(st.floats(-0.4, 0.4), min_size=8, max_size=8),
+    coefficients=st.lists(st.floats(-0.4, 0.4), min_size=12, max_size=12),
     tangent=st.floats(0, 3),
     turn=st.floats(-math.pi, math.pi),
 )
 def test_a_valid_perspective_projection_can_be_inverted(model, coefficients, tangent, turn):
     info = model_by_name(model)
     extra = [
-        0.01 * c if "p" in info.param_names[i] else c for i, c in zip(info.extra_indices, coefficients, strict=False)
+        0.01 * c if info.param_names[i][0] in "ps" else c
+        for i, c in zip(info.extra_indices, coefficients, strict=False)
     ]
     camera = Camera(model, 800, 600, np.array([*[300.0] * len(info.focal_indices), 400, 300, *extra]))
     point = np.array([[tangent * math.cos(turn), tangent * math.sin(turn), 1.0]])

@@ -88,6 +88,9 @@ def test_a_slope_that_touches_zero_or_nearly_does_is_told_apart():
         ("SIMPLE_RADIAL_FISHEYE", [-0.08]),
         ("THIN_PRISM_FISHEYE", [-0.05, -0.01, 1e-3, 1e-3, 0.0, 0.0, 1e-3, 1e-3]),
         ("EUCM", [0.7, 1.1]),
+        ("FULL_OPENCV_THIN_PRISM", [-0.3, 0.05, 1e-3, -2e-3, -0.01, 0.05, 0, 0, 1e-3, 0, -1e-3, 1e-3]),
+        ("DOUBLE_SPHERE", [0.3, 0.7]),
+        ("DOUBLE_SPHERE", [-0.4, 0.55]),
     ],
 )
 def test_pixels_beyond_the_rim_have_no_ray(model, extra):

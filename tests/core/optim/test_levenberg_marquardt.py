@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm.core.optim import StopRules, Trial, minimize
+from sfm.core.optim.levenberg_marquardt import steepness
 
 
 class Curve:
@@ -27,7 +28,8 @@ class Curve:
         self.tried = self.x + delta
         r = self.residuals(self.tried)
         predicted = -0.5 * self.g @ delta + 0.5 * damping * delta @ (D * delta)
-        return Trial(0.5 * r @ r, float(predicted), float(np.linalg.norm(delta)), float(np.linalg.norm(self.x)))
+        step, norm = float(np.linalg.norm(delta)), float(np.linalg.norm(self.x))
+        return Trial(0.5 * r @ r, float(predicted), step, norm, steepness(self.g, D, 0.5 * self.r @ self.r))
 
     def accept(self):
         self.x = self.tried
@@ -41,13 +43,16 @@ def rosenbrock(x=(-1.2, 1.0)):
     )
 
 
-def decay():
+def decay(unit=1.0, rate=1.0):
+    """A curve with residuals that stay; its residuals times `unit`, its second parameter in 1 / `rate`."""
     times = np.linspace(0, 3, 20)
     values = 2 * np.exp(-1.3 * times) + 0.01 * np.cos(40 * times)
     return Curve(
-        lambda x: x[0] * np.exp(-x[1] * times) - values,
-        lambda x: np.stack([np.exp(-x[1] * times), -times * x[0] * np.exp(-x[1] * times)], 1),
-        (1.0, 0.1),
+        lambda x: unit * (x[0] * np.exp(-x[1] * rate * times) - values),
+        lambda x: (
+            unit * np.stack([np.exp(-x[1] * rate * times), -rate * times * x[0] * np.exp(-x[1] * rate * times)], 1)
+        ),
+        (1.0, 0.1 / rate),
     )
 
 
@@ -73,6 +78,29 @@ def test_a_small_relative_decrease_ends_the_loop_where_the_gradient_is_small():
     assert summary.reason == "relative_cost"
     np.testing.assert_allclose(system.x, [2, 1.3], atol=0.02)
     assert summary.iterations[-1].gradient_max < 1e-5
+
+
+def test_the_gradient_ends_the_loop_alike_in_all_units():
+    rules = StopRules(relative_cost_tolerance=0.0, gradient_tolerance=1e-6)
+    plain = minimize(decay(), rules)
+    assert plain.reason == "gradient"
+    for unit, rate in ((1e-6, 1.0), (1e6, 1.0), (1.0, 1e5), (1e-3, 1e-4)):
+        system = decay(unit, rate)
+        summary = minimize(system, rules)
+        assert summary.reason == "gradient"
+        assert len(summary.iterations) == len(plain.iterations)
+        # It ends where the gradient is flat, before a step from there is taken.
+        assert steepness(system.g, np.diag(system.H), summary.final_cost) <= 1e-6
+        assert summary.iterations[-1].accepted
+
+
+def test_steepness_is_the_largest_cosine_between_residuals_and_columns(rng):
+    J, r = rng.normal(size=(20, 5)), rng.normal(size=20)
+    cosines = np.abs(J.T @ r) / np.linalg.norm(J, axis=0) / np.linalg.norm(r)
+    found = steepness(J.T @ r, np.sum(J**2, axis=0), 0.5 * float(r @ r))
+    assert found == pytest.approx(cosines.max())
+    assert steepness(np.zeros(5), np.zeros(5), 1.0) == 0
+    assert steepness(np.zeros((0, 6)), np.zeros((0, 6)), 1.0) == 0
 
 
 def test_a_start_at_the_solution_ends_at_once():

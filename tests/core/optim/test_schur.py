@@ -69,13 +69,13 @@ class Problem:
 
     def eliminate(self, pattern, ranges, narrow=False):
         blocks, side = np.zeros((len(pattern.columns), 6, 8)), np.zeros((self.rows, 8))
-        diagonal = np.zeros((self.rows, 6))
+        diagonal = np.zeros((self.rows, 8))
         for first, last in ranges:
             schur.eliminate(
                 first, last, narrow, *self.couplings, self.centers, self.X, self.M, self.g, pattern.offsets,
                 pattern.columns, blocks, side, diagonal,
             )  # fmt: skip
-        return blocks[:, :, :6], side[:, :6], diagonal
+        return blocks[:, :, :6], side[:, :6], diagonal[:, :6]
 
     def dense(self):
         """U of the poses, S and the right-hand side."""

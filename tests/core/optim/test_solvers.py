@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
+import types
 
 import numpy as np
 import pytest
 
+from sfm.core.errors import MissingDependencyError
 from sfm.core.optim import dense_cholesky, sparse_cholesky
 from sfm.core.optim.block_pattern import BlockPattern
+from sfm.core.optim.cholmod import CholmodCholesky
 from sfm.core.optim.dense_cholesky import DenseCholesky
-from sfm.core.optim.preconditioners import BlockJacobi
 from sfm.core.optim.solvers import ReducedSolver, forecast_cheapest, forecast_dense, forecast_sparse, make_solver
 from sfm.core.optim.sparse_cholesky import SparseCholesky
+from sfm.core.optional import import_cholmod
 
-exact = pytest.mark.parametrize("kind", [DenseCholesky, SparseCholesky], ids=lambda kind: kind.__name__)
+try:
+    import_cholmod()
+    without_cholmod = False
+except MissingDependencyError:
+    without_cholmod = True
+needs_cholmod = pytest.mark.skipif(without_cholmod, reason="scikit-sparse 0.4 is not installed")
+OURS = [pytest.param(kind, id=kind.__name__) for kind in (DenseCholesky, SparseCholesky)]
+ours = pytest.mark.parametrize("kind", OURS)
+exact = pytest.mark.parametrize("kind", [*OURS, pytest.param(CholmodCholesky, marks=needs_cholmod, id="Cholmod")])
 
 
 def lower_blocks(S, pattern):
@@ -109,7 +121,7 @@ def test_badly_scaled_systems_are_solved_to_a_small_residual(kind, rng):
     np.testing.assert_allclose((S @ solver.solve(side) - side) / scale, 0, atol=1e-9 * np.abs(side / scale).max())
 
 
-@exact
+@ours
 @pytest.mark.parametrize("held_part", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize(("rows", "pairs"), [(0, 0), (1, 0), (9, 12), (40, 60), (60, 3000)])
 def test_blocks_of_the_inverse_equal_numpys(kind, rng, rows, pairs, held_part):
@@ -130,7 +142,7 @@ def test_rows_on_their_own_are_solved_by_all_alike(rng):
     pattern, S = random_system(rng, 30, 0)
     held, damping, side = rng.random(180) < 0.3, rng.random(180), rng.normal(size=180)
     held[:6] = True
-    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+    for kind in (SparseCholesky, DenseCholesky):
         solver = kind(pattern, held)
         assert solver.factor(lower_blocks(S, pattern), damping, 1)
         np.testing.assert_allclose(solver.solve(side), reference(S, damping, held, side), rtol=0, atol=1e-13)
@@ -138,7 +150,7 @@ def test_rows_on_their_own_are_solved_by_all_alike(rng):
 
 def test_all_solvers_are_reduced_solvers():
     pattern, held = BlockPattern.full(2), np.zeros(12, bool)
-    for kind in (BlockJacobi, SparseCholesky, DenseCholesky):
+    for kind in (SparseCholesky, DenseCholesky):
         assert isinstance(kind(pattern, held), ReducedSolver)
 
 
@@ -195,3 +207,28 @@ def test_a_sparse_factor_of_a_street_takes_a_small_part_of_the_work_of_a_dense_o
         sparse, dense = forecast_sparse(pattern, held), forecast_dense(held)
         assert sparse.operations < 0.05 * dense.operations
         assert sparse.bytes < 0.3 * dense.bytes
+
+
+@pytest.mark.parametrize("installed", [None, types.ModuleType("sksparse")])
+def test_cholmod_says_so_where_it_is_missing_or_another(monkeypatch, installed):
+    if installed is not None:
+        installed.cholmod = types.ModuleType("sksparse.cholmod")
+    monkeypatch.setitem(sys.modules, "sksparse", installed)
+    monkeypatch.setitem(sys.modules, "sksparse.cholmod", None if installed is None else installed.cholmod)
+    with pytest.raises(MissingDependencyError, match=r"CHOLMOD"):
+        CholmodCholesky(BlockPattern.full(2), np.zeros(12, bool))
+
+
+def test_the_least_pivot_is_the_inverse_of_the_largest_last_variance(rng):
+    # With the rows apart each pivot stands alone: that of an entry on the diagonal, given those before it.
+    pattern, S = random_system(rng, 20, 0)
+    held = rng.random(120) < 0.2
+    pivots = []
+    for k in range(0, 120, 6):
+        free = np.flatnonzero(~held[k : k + 6]) + k
+        pivots += [*np.diag(np.linalg.cholesky(S[np.ix_(free, free)])) ** 2]
+    for kind in (DenseCholesky, SparseCholesky):
+        solver = kind(pattern, held)
+        assert solver.factor(lower_blocks(S, pattern), np.zeros(120), 1)
+        assert solver.least_pivot() == pytest.approx(min(pivots), rel=1e-12)
+        assert kind(pattern, np.ones(120, bool)).least_pivot() == np.inf

@@ -1,0 +1,60 @@
+"""`calib convert`: what it prints and how it ends."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.cli import main
+from sfm.core.cameras import Camera
+from sfm.core.errors import ExitCode
+from sfm.io.camera_files import read_intrinsics, write_camera_toml
+
+BENT = Camera("FULL_OPENCV", 640, 480, np.array([536.0, 536, 342.8, 236, -0.27, 0.04, 1e-3, 0, -0.03, 0, 0, 0]))
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Path:
+    write_camera_toml(tmp_path / "camera.toml", BENT, name="left")
+    return tmp_path / "camera.toml"
+
+
+def test_an_export_tells_how_far_it_is_off(camera: Path, capsys) -> None:
+    target = camera.with_name("info.yaml")
+    assert main(["convert", str(camera), "-o", str(target), "--to", "ros"]) == ExitCode.OK
+    told = capsys.readouterr().out
+    assert "left FULL_OPENCV 640x480" in told
+    assert "read again" in told
+    assert "largest difference" in told
+    assert "camera_name: left" in target.read_text()
+    np.testing.assert_allclose(read_intrinsics(target)[1].params, BENT.params)
+
+
+def test_a_fit_tells_how_far_it_is_off_and_without_one_a_lens_is_refused(camera: Path, capsys) -> None:
+    words = ["convert", str(camera), "-o", str(camera.with_name("chain.yaml")), "--to", "kalibr"]
+    assert main(words) == ExitCode.BAD_INPUT
+    assert "no place for k3 = -0.03" in capsys.readouterr().err
+    assert main([*words, "--fit", "opencv"]) == ExitCode.OK
+    assert "left as OPENCV: off by up to" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "told"),
+    [
+        (["-o", "x.yaml"], ExitCode.USAGE, "--to parallax|colmap"),
+        (["-o", "x.toml", "--fit", "OPENCVV"], ExitCode.USAGE, "there is no such model"),
+        (["-o", "x.toml", "--camera", "right"], ExitCode.USAGE, "there are left"),
+        (["-o", "x.toml", "--size", "640"], ExitCode.USAGE, "WIDTHxHEIGHT"),
+        (["-o", "camera.toml"], ExitCode.USAGE, "both source and target"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_a_line(camera: Path, capsys, monkeypatch, words, code, told) -> None:
+    monkeypatch.chdir(camera.parent)
+    before = camera.read_bytes()
+    assert main(["convert", "camera.toml", *words]) == code
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert camera.read_bytes() == before
