@@ -16,6 +16,8 @@ COMMANDS = {
     "detect": "the corners of a board in photos, and what they look like",
     "camera": "photos of a board → a camera, and how far to trust it",
     "check": "whether other photos agree with a camera, and which would help most",
+    "report": "a calibration as one HTML page: coverage, residuals, uncertainty, the board's shape",
+    "view": "the boards before the camera, in the Rerun viewer",
     "stereo": "two cameras that are mounted together, and how they stand",
     "rig": "several such cameras, of any models",
     "handeye": "where a camera sits on a robot, from photos and the robot's poses",

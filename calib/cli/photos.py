@@ -21,6 +21,7 @@ import numpy as np
 import calib
 from calib.boards import Board
 from calib.detect import DetectConfig, Detection, detect_board
+from sfm.core.arrays import ImageU8
 from sfm.core.errors import ImageError, InputError, Rejected
 from sfm.core.events import SILENT, ImageRead, Observer, StageFinished, StageStarted
 from sfm.core.execution import available_threads, ordered_map
@@ -49,6 +50,17 @@ def find_photos(sources: Sequence[Path]) -> dict[str, Path]:
     if not photos:
         raise InputError("holds no image", path=sources[0] if sources else None)
     return photos
+
+
+def photos_of(sources: Sequence[Path], names: Sequence[str]) -> dict[str, ImageU8]:
+    """The photos of some names, as they are; those that are not there or cannot be read are left out."""
+    out = {}
+    with contextlib.suppress(InputError):
+        photos = find_photos(sources)
+        for name in names:
+            with contextlib.suppress(KeyError, ImageError):
+                out[name] = read_image(photos[name])
+    return out
 
 
 def detect_photos(
