@@ -26,7 +26,7 @@ from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.execution import chunk_bounds
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
-_OBSERVATIONS_PER_CHUNK, _MAX_CHUNKS = 8192, 16
+_OBSERVATIONS_PER_CHUNK, _MAX_CHUNKS = 16384, 16
 """At most, and chunks are a power of two: three would keep one of two threads waiting."""
 _OWN_WORK, _NARROW_WORK = 4.0, 0.6
 """What a coupling takes beside its products with others, and what a product of three rows takes instead of six."""
