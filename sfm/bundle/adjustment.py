@@ -12,7 +12,7 @@ import numpy as np
 from sfm.bundle.gauge import held_by_three_points, held_by_two_cameras, put_back, put_back_by_points
 from sfm.bundle.layout import lay_out
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
-from sfm.bundle.reduced import SolverPlan
+from sfm.bundle.solver_plan import SolverPlan
 from sfm.bundle.system import BundleSystem
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.events import SILENT, BundleAdjusted, BundlePlanned, Observer

@@ -36,7 +36,7 @@ from sfm.bundle.knowledge import Knowledge, motions_seen
 from sfm.bundle.layout import Layout, lay_out
 from sfm.bundle.marginals import Marginals
 from sfm.bundle.problem import BundleConfig, BundleProblem
-from sfm.bundle.reduced import plan_solver
+from sfm.bundle.solver_plan import plan_solver
 from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected

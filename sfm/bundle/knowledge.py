@@ -14,6 +14,7 @@ import numpy as np
 from sfm.bundle.gauge import frame_centers
 from sfm.bundle.layout import Layout
 from sfm.bundle.mounted_terms import by_sensors, on_frames
+from sfm.bundle.own_blocks import RowTerms
 from sfm.bundle.prior_terms import (
     PriorTerms,
     bias_count,
@@ -24,7 +25,6 @@ from sfm.bundle.prior_terms import (
 )
 from sfm.bundle.priors import DistancePrior, GravityPrior, whitening
 from sfm.bundle.problem import BundleProblem
-from sfm.bundle.reduced import RowTerms
 from sfm.core.arrays import FloatArray
 from sfm.core.geometry.rotation import skew
 from sfm.core.optim.block_pattern import BLOCK

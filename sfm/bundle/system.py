@@ -16,7 +16,6 @@ Points are cut into chunks whose number depends on the problem alone and whose s
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -29,14 +28,15 @@ from sfm.bundle.gauge import HeldPoints
 from sfm.bundle.knowledge import Knowledge
 from sfm.bundle.layout import Layout
 from sfm.bundle.marginals import Marginals
-from sfm.bundle.prior_terms import bias_count
+from sfm.bundle.own_blocks import ImageSums
 from sfm.bundle.problem import BundleConfig, BundleProblem
-from sfm.bundle.reduced import ImageSums, ReducedSystem, SolverPlan, plan_solver
+from sfm.bundle.reduced import ReducedSystem
 from sfm.bundle.rig_arrays import RigArrays
+from sfm.bundle.solver_plan import SolverPlan, plan_solver
+from sfm.bundle.state import Places, State
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.execution import Workers
 from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.block_pattern import BLOCK
 from sfm.core.optim.levenberg_marquardt import Trial, steepness
 from sfm.core.optim.losses import Loss, loss_id
@@ -66,8 +66,8 @@ class BundleSystem:
         self.free_points = problem.free_points.copy()
         self._loss, self._scale, self.lost_cost = loss_id(config.loss), float(config.loss_scale_px), 1e300
         self._cost, self._flat = 0.0, config.gradient_tolerance
-        self._state = _State.of(problem)
-        self._trial, self._places = self._state.copy(), _Places.of(layout)
+        self._state = State.of(problem)
+        self._trial, self._places = self._state.copy(), Places.of(layout)
 
         images, points, widest = len(self._image_cameras), len(problem.points3D), layout.columns.shape[1]
         self.held = layout.padding
@@ -230,7 +230,7 @@ class BundleSystem:
         self._state, self._trial = self._trial, self._state
 
     def _over_images(
-        self, state: _State, points3D: FloatArray, loss: int, lost_cost: float, costs: FloatArray | None
+        self, state: State, points3D: FloatArray, loss: int, lost_cost: float, costs: FloatArray | None
     ) -> float:
         """The cost of a linearisation, or what each observation costs into `costs` (n,), by points."""
         lay, sums, limits = self.layout, self._images, kernels.squared_limits(self._model_ids, state.params)
@@ -283,117 +283,5 @@ class Information(NamedTuple):
     M: np.ndarray
 
 
-class _Frames(NamedTuple):
-    """Poses (F, 4), (F, 3), (F, 3, 3) and (F, 3) of the frames; what `turn_poses` moves."""
-
-    wxyz: np.ndarray
-    centers: np.ndarray
-    rotations: np.ndarray
-    translations: np.ndarray
-
-    @property
-    def poses(self) -> Rigid3:
-        return Rigid3(Rotation3(self.wxyz.copy()), self.translations.copy())
-
-    def copy(self) -> _Frames:
-        return _Frames(*(part.copy() for part in self))
-
-
-class _Places(NamedTuple):
-    """Where a step (rows, 6) has what belongs to parameters, sensors and biases.
-
-    Attributes:
-        cells, entries: camera and column of each parameter, and its number among those of the step.
-        sensors, sensor_rows: sensors that move and their rows; bias_rows: of the biases.
-    """
-
-    cells: tuple[np.ndarray, np.ndarray]
-    entries: np.ndarray
-    sensors: np.ndarray
-    sensor_rows: np.ndarray
-    bias_rows: np.ndarray
-
-    @staticmethod
-    def of(layout: Layout) -> _Places:
-        shared, poses = layout.shared, len(layout.slot_frame)
-        camera, column, row, place = layout.parameters
-        mounted = np.flatnonzero(shared.sensor >= 0)
-        return _Places(
-            (camera, column),
-            BLOCK * row + place,
-            shared.sensor[mounted],
-            poses + mounted,
-            poses + np.flatnonzero(shared.bias >= 0),
-        )
-
-
-@dataclasses.dataclass(slots=True)
-class _State:
-    """Parameters as kernels want them; what is constant is the same in both states of a system.
-
-    Attributes:
-        images: rotations (I, 3, 3), translations (I, 3) and centres (I, 3) of the images; without rigs, of the frames.
-    """
-
-    frames: _Frames
-    images: tuple[np.ndarray, np.ndarray, np.ndarray]
-    sensors: Rigid3
-    params: np.ndarray
-    points3D: np.ndarray
-    biases: np.ndarray
-    lost: int = 0
-
-    @staticmethod
-    def of(problem: BundleProblem) -> _State:
-        rigs, poses = problem.rigs, problem.cams_from_world
-        moving = poses if rigs is None else rigs.rigs_from_world
-        turns = moving.rotation.matrix
-        centers = -np.einsum("fji,fj->fi", turns, moving.translation)
-        frames = _Frames(moving.rotation.wxyz.copy(), centers, turns, moving.translation.copy())
-        return _State(
-            frames,
-            (frames.rotations, frames.translations, frames.centers) if rigs is None else _as_arrays(poses),
-            Rigid3.identity((0,)) if rigs is None else rigs.sensors_from_rig,
-            problem.camera_params.copy(),
-            problem.points3D.copy(),
-            np.zeros((bias_count(problem.pose_priors), 3)),
-        )
-
-    def copy(self) -> _State:
-        parts = {name: getattr(self, name).copy() for name in ("frames", "params", "points3D", "biases")}
-        copied = dataclasses.replace(self, **parts)
-        if self.images[0] is self.frames.rotations:
-            copied.images = copied.frames.rotations, copied.frames.translations, copied.frames.centers
-        return copied
-
-    def mounted(self, rigs: RigArrays) -> RigArrays:
-        """`rigs` where they are now."""
-        return dataclasses.replace(rigs, rigs_from_world=self.frames.poses, sensors_from_rig=self.sensors)
-
-    def move(
-        self, delta: FloatArray, moving: np.ndarray, places: _Places, rigs: RigArrays | None, then: _State
-    ) -> None:
-        """Fills `then` with the poses and parameters after a step (rows, 6) of the reduced system."""
-        kernels.turn_poses(moving, delta, *self.frames, *then.frames)
-        then.params[places.cells] = self.params[places.cells] + delta.ravel()[places.entries]
-        then.biases[:] = self.biases + delta[places.bias_rows, :3]
-        if rigs is not None:
-            then.sensors = _shifted(self.sensors, places.sensors, delta[places.sensor_rows])
-            then.images = _as_arrays(then.mounted(rigs).cams_from_world)
-
-
-def _as_arrays(poses: Rigid3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return poses.rotation.matrix, poses.translation.copy(), poses.center
-
-
 def _squared(numbers: FloatArray) -> float:
     return float((numbers * numbers).sum())
-
-
-def _shifted(sensors: Rigid3, moving: np.ndarray, delta: FloatArray) -> Rigid3:
-    """Sensors of which some moved by (ω, υ) on the left: exp(ω) R and exp(ω) t + υ."""
-    turn = Rotation3.exp(delta[:, :3])
-    turns, translations = sensors.rotation.wxyz.copy(), sensors.translation.copy()
-    turns[moving] = (turn @ sensors.rotation[moving]).wxyz
-    translations[moving] = turn @ translations[moving] + delta[:, 3:]
-    return Rigid3(Rotation3(turns), translations)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sfm.bundle.reconstruction import Intrinsics
     from sfm.core.events import Event
     from sfm.pipeline.priors import Measurements, PriorConfig
-    from sfm.pipeline.refinement import MeasuredFrame, RefinedModel
 
 EXAMPLES = (
     "sfm refine scene -o scene/refined --refine focal,pp,distortion",
@@ -163,6 +162,7 @@ def main(words: Sequence[str]) -> int:
 
     from sfm.bundle import BundleConfig
     from sfm.cli.compare import model_folder
+    from sfm.cli.refine_report import summary
     from sfm.core.execution import available_threads
     from sfm.core.optim.losses import LOSSES
     from sfm.io.atomic import write_text
@@ -297,67 +297,3 @@ def _listed(words: str, known: Sequence[str], option: str) -> list[str]:
         if name not in known:
             raise ConfigError(f"{option} knows no {name!r}", remedy=f"choose from {', '.join([*known, 'none'])}")
     return names
-
-
-_REASONS = {
-    "relative_cost": "a full step hardly lowered the cost",
-    "gradient": "the gradient vanished (residuals are perpendicular to what parameters do to them)",
-    "step": "steps became as small as rounding errors",
-    "max_iterations": "NOT CONVERGED: the limit of iterations was reached",
-    "no_free_parameters": "nothing was free to change",
-}
-
-
-def summary(refined: RefinedModel, folder: Path) -> str:
-    """A few lines for a person."""
-    result, model = refined.result, refined.reconstruction
-    count = max(len(result.problem.obs_images) - result.invalid, 1)
-    how = " (by the loss)"
-    before, after = ((2 * cost / count) ** 0.5 for cost in (result.initial_cost, result.final_cost))
-    if refined.frame is not None:
-        # The cost is also that of the measurements.
-        how, (before, after) = "", refined.frame.rms_px
-    lines = [
-        f"{len(model.image_ids)} images · {len(model.points3D)} points · {count} observations",
-        f"root mean square reprojection error {before:.4f} → {after:.4f} px{how}, "
-        f"cost {result.initial_cost:.6g} → {result.final_cost:.6g}",
-        f"{result.iterations} iterations; {_REASONS[result.reason]}",
-        *_measured_lines(refined.frame),
-    ]
-    if result.invalid:
-        lines.append(f"{result.invalid} observations have no projection (behind the camera) and took no part")
-    if result.lost:
-        lines.append(f"{result.lost} observations lost their projection on the way")
-    for camera_id, names in list(refined.at_bounds.items())[:5]:
-        lines.append(f"camera {camera_id}: {', '.join(names)} ended on a bound")
-    if len(refined.at_bounds) > 5:
-        lines.append(f"and parameters of {len(refined.at_bounds) - 5} more cameras")
-    if refined.undetermined:
-        lines.append(f"no standard deviations: the observations leave open {refined.undetermined}")
-    for camera_id, camera in list(model.cameras.items())[:5]:
-        sigmas = refined.sigmas(camera_id)
-        told = [
-            f"{name} {value:.6g}" + (f" ± {sigmas[k]:.2g}" if sigmas is not None and sigmas[k] > 0 else "")
-            for k, (name, value) in enumerate(zip(camera.model_info.param_names, camera.params, strict=True))
-        ]
-        lines.append(f"camera {camera_id}  {camera.model}  {'  '.join(told)}")
-    if len(model.cameras) > 5:
-        lines.append(f"and {len(model.cameras) - 5} more cameras (--json has them all)")
-    return "\n".join([*lines, f"model    {folder}"])
-
-
-def _measured_lines(frame: MeasuredFrame | None) -> list[str]:
-    if frame is None:
-        return []
-    lines = []
-    for kind, after in frame.deviations[1].items():
-        before, bias = frame.deviations[0][kind], after.get("bias")
-        line = f"{kind:<15}{after['count']}, {before['rms_sigmas']:.3g} → {after['rms_sigmas']:.3g} standard deviations"
-        line += f", {after['unlikely']} hardly by chance" if after["unlikely"] else ""
-        lines.append(line + (f", all shifted by {' '.join(f'{b:.3g}' for b in bias)}" if bias else ""))
-    if frame.not_in_model:
-        lines.append(f"{frame.not_in_model} of the measurements are of images or points that the model lacks")
-    if frame.origin is not None:
-        latitude, longitude, height = frame.origin
-        lines.append(f"frame    east, north, up in m from {latitude:.7f}, {longitude:.7f}, {height:.2f} m (frame.json)")
-    return lines
