@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from calib.rig import RigCalibration
+from calib.rig_result import RigCalibration
 from sfm.core.arrays import FloatArray, Points2D, Rays, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3

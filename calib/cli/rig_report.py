@@ -13,9 +13,9 @@ import numpy as np
 from calib import __version__
 from calib.boards import Board
 from calib.cli.calibrating import Sightings
-from calib.rig import RigCalibration
 from calib.rig_epipolar import EpipolarErrors, epipolar_errors
 from calib.rig_frames import FrameTable
+from calib.rig_result import RigCalibration
 from calib.rig_shapes import RankedRig
 from calib.rig_uncertainty import RelativeUncertainty, RigCovariance, relative_uncertainty, rig_covariance
 from sfm.core.errors import Rejected

@@ -302,7 +302,7 @@ def _lens_of(camera: Camera) -> str:
 def _calibrated(
     board: Board, cameras: Sequence[RigCamera], turns: Sequence[object], options: CommonOptions
 ) -> tuple[RankedRig, ...] | Rejected:
-    from calib.rig import RigConfig
+    from calib.rig_result import RigConfig
     from calib.rig_shapes import CANDIDATES, choose_rig_shape
 
     config = RigConfig(refine_intrinsics=not options.hold, refine_known=options.refine_known)
