@@ -12,12 +12,13 @@ from calib.refine import Calibration
 from calib.refine_board import BoardShape, ShapeKind
 from calib.refine_fit import CalibrationConfig
 from calib.refine_reject import RejectedView
+from calib.refine_views import Observations
 from calib.rig_alone import AloneCamera
 from calib.rig_estimate import RigEstimate
 from calib.rig_reject import RigFit
 from calib.rig_system import RigSystem
 from calib.rig_views import RigObservations
-from sfm.core.arrays import Value
+from sfm.core.arrays import Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 
@@ -63,6 +64,22 @@ class RigConfig:
             relative_cost_tolerance=self.relative_cost_tolerance,
             keep_invertible=self.keep_invertible,
         )
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CameraOfRig(Value):
+    """One camera of a rig with what it saw; residuals (n, 2) are projected − observed, px."""
+
+    camera: Camera
+    observations: Observations
+    residuals: Float64[np.ndarray, "n 2"]
+
+    @property
+    def view_rms_px(self) -> Vector:
+        """(V,) of each view."""
+        squares = np.sum(self.residuals**2, axis=1)
+        counts = np.bincount(self.observations.view_of, minlength=len(self.observations))
+        return np.sqrt(np.bincount(self.observations.view_of, squares, len(counts)) / np.maximum(counts, 1))
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -126,6 +143,10 @@ class RigCalibration(Value):
     def camera_rms_px(self) -> tuple[float, ...]:
         """As `rms_px`, of each camera."""
         return tuple(math.sqrt(float(np.mean(np.sum(r**2, axis=1)))) for r in self.residuals)
+
+    def one_camera(self, camera: int) -> CameraOfRig:
+        """What the rig says of one of its cameras."""
+        return CameraOfRig(self.cameras[camera], self.observations.cameras[camera], self.residuals[camera])
 
     @property
     def fit(self) -> RigFit:

@@ -106,12 +106,17 @@ def checked(options: CommonOptions, sources: Mapping[str, str]) -> tuple[Board, 
         if value not in known:
             raise ConfigError(f"unknown --{option} {value!r}", remedy=f"known are {', '.join(known)}")
     lenses_of(options, tuple(sources))
-    files = {name: _expanded(source) for name, source in sources.items()}
+    files = {name: expanded(source) for name, source in sources.items()}
     known_cameras(options, tuple(sources))
     return board_of(options.board), files
 
 
-def _expanded(source: str) -> tuple[Path, ...]:
+def expanded(source: str) -> tuple[Path, ...]:
+    """The folder that is named, or the files that a pattern finds.
+
+    Raises:
+        InputError: a pattern finds none.
+    """
     path = Path(source)
     if path.exists() or not any(sign in source for sign in "*?["):
         return (path,)

@@ -38,12 +38,12 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
 
     observer = told()
     with kernels_announced(observer):
-        seen, table = see_rig(files, board, options)
+        seen, table = see_rig(files, board, pair=options.pair, threads=options.threads, cached=not options.no_cache)
         cameras = rig_cameras(seen, files, table, options)
         ranked = _calibrated(board, cameras, board_turns(board), options)
     if isinstance(ranked, Rejected):
-        raise _refusal(ranked, seen)
-    write_rig_file(options.output, rig_record(ranked[0], seen, board, command))
+        raise rig_refused(ranked, seen)
+    write_rig_file(options.output, rig_record(ranked[0], seen, table, board, command))
     if options.json:
         import json
 
@@ -54,10 +54,13 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
 
 
 def see_rig(
-    files: Mapping[str, tuple[Path, ...]], board: Board, options: CommonOptions
+    files: Mapping[str, tuple[Path, ...]], board: Board, *, pair: str, threads: int, cached: bool = True
 ) -> tuple[dict[str, Sightings], FrameTable]:
     """What each camera sees of the board, and which photos belong together.
 
+    Args:
+        pair: one of `rig_frames.PAIRINGS`.
+        cached: takes detections that are kept, and keeps new ones.
     Raises:
         ReconstructionError: photos cannot be paired.
     """
@@ -66,9 +69,8 @@ def see_rig(
     from calib.cli.refusals import no_board
     from calib.rig_frames import pair_photos
 
-    cached = not options.no_cache
     seen = {
-        name: see_board(paths, board, threads=options.threads, use_cache=cached, observer=told())
+        name: see_board(paths, board, threads=threads, use_cache=cached, observer=told())
         for name, paths in files.items()
     }
     for name, one in seen.items():
@@ -78,11 +80,11 @@ def see_rig(
     for name, one in seen.items():
         if one.digest in digests:
             refusal = Rejected("same_photos", f"{digests[one.digest]} and {name} are the very same photos")
-            raise _refusal(refusal, seen)
+            raise rig_refused(refusal, seen)
         digests[one.digest] = name
-    table = pair_photos({name: _names(one) for name, one in seen.items()}, options.pair)  # pyright: ignore
+    table = pair_photos({name: _names(one) for name, one in seen.items()}, pair)  # pyright: ignore
     if isinstance(table, Rejected):
-        raise _refusal(table, seen)
+        raise rig_refused(table, seen)
     return seen, table
 
 
@@ -102,7 +104,7 @@ def rig_cameras(
 
     names = tuple(seen)
     lenses, known = lenses_of(options, names), known_cameras(options, names)
-    lenses |= {name: _lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
+    lenses |= {name: lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
     lenses |= _chosen({name: one for name, one in seen.items() if lenses[name] == AUTO}, files, options.seed)
     return [
         RigCamera(
@@ -145,10 +147,18 @@ def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]]
     return {name: alike(name) for name in found}
 
 
-def _lens_of(camera: Camera) -> str:
+def lens_of(camera: Camera) -> str:
+    """The lens with the fewest coefficients that this camera may have come from."""
+    import numpy as np
+
     from calib.refine_lenses import LENSES
 
-    return next((lens.name for lens in LENSES if lens.model == camera.model), "opencv5")
+    for lens in (lens for lens in LENSES if lens.model == camera.model):
+        # What a lens does not estimate stays as it starts.
+        start = lens.camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0).params
+        if np.array_equal(np.delete(start, lens.columns()), np.delete(camera.params, lens.columns())):
+            return lens.name
+    return "opencv5"
 
 
 def _calibrated(
@@ -162,7 +172,8 @@ def _calibrated(
     return choose_rig_shape(board.points3D, cameras, config, turns=turns, shapes=shapes, seed=options.seed)  # pyright: ignore
 
 
-def _refusal(why: Rejected, seen: Mapping[str, Sightings]) -> ReconstructionError:
+def rig_refused(why: Rejected, seen: Mapping[str, Sightings]) -> ReconstructionError:
+    """The error for photos that give no rig."""
     remedy = _REMEDIES.get(why.reason, "look at `calib detect` for each camera, and see docs/calibrate_rigs.md")
     counts = ", ".join(f"{name} {len(one.views)} of {one.count}" for name, one in seen.items())
     return ReconstructionError(f"{why.reason}: {why.detail} (photos with the board: {counts})", remedy=remedy)

@@ -90,6 +90,16 @@ class RigFile(Value):
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
 
+def is_rig_file(path: Path | str) -> bool:
+    """Whether a calibration file is that of a rig.
+
+    Raises:
+        InputError: the file cannot be opened.
+        FormatError: it is no TOML.
+    """
+    return "rig" in toml_document(Path(path))
+
+
 def read_rig_file(path: Path | str) -> RigFile:
     """The rig of a `.toml`; focal lengths count as measured.
 
