@@ -92,7 +92,8 @@ def sources_of(words: Sequence[str], names: Sequence[str], path: Path) -> dict[s
     given = named_sources(words)
     if set(given) == set(names):
         return {name: given[name] for name in names}
-    if len(given) == len(names) and not set(given) & set(names):
+    called = any("=" in word and not Path(word).exists() for word in words)
+    if len(given) == len(names) and not called and not set(given) & set(names):
         return dict(zip(names, given.values(), strict=True))
     told = f"has the cameras {', '.join(names)}; photos are named of {', '.join(given)}"
     raise ConfigError(told, path=path, remedy=f"name a folder for each: {' '.join(f'{name}=DIR' for name in names)}")

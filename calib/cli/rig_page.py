@@ -107,8 +107,8 @@ def _mounts(found: RigCalibration, covariances: RigCovariance | Rejected) -> str
         cam_from_rig = found.cams_from_rig[c]
         known = None if isinstance(covariances, Rejected) else relative_uncertainty(found, covariances, 0, c)
         place, turn = 1e3 * cam_from_rig.center, np.degrees(cam_from_rig.rotation.inverse().log())
-        place_sigma = None if known is None or not c else 1e3 * _sigma_of_place(known)
-        turn_sigma = None if known is None or not c else np.degrees(_sigma_of_turn(known))
+        place_sigma = None if known is None or not c else 1e3 * place_sigmas(known)
+        turn_sigma = None if known is None or not c else np.degrees(turn_sigmas(known))
         rows.append([name, *_with_sigma(place, place_sigma), *_with_sigma(turn, turn_sigma)])
     note = (
         '<p class="quiet">Where each camera is in the frame of the first, and how it is turned there, as a vector '
@@ -117,13 +117,13 @@ def _mounts(found: RigCalibration, covariances: RigCovariance | Rejected) -> str
     return table(["", "x mm", "y mm", "z mm", "about x °", "about y °", "about z °"], rows) + note
 
 
-def _sigma_of_place(known: RelativeUncertainty) -> FloatArray:
+def place_sigmas(known: RelativeUncertainty) -> FloatArray:
     """(3,) of the camera's centre along the rig's axes: δ = −Rᵀ υ, as the centre does not move with turns about it."""
     R = known.cam2_from_cam1.rotation.matrix
     return np.sqrt(np.maximum(np.diag(R.T @ known.covariance[3:, 3:] @ R), 0.0))
 
 
-def _sigma_of_turn(known: RelativeUncertainty) -> FloatArray:
+def turn_sigmas(known: RelativeUncertainty) -> FloatArray:
     """(3,) of turns about the rig's axes, radians."""
     R = known.cam2_from_cam1.rotation.matrix
     return np.sqrt(np.maximum(np.diag(R.T @ known.covariance[:3, :3] @ R), 0.0))

@@ -151,14 +151,15 @@ def lens_of(camera: Camera) -> str:
     """The lens with the fewest coefficients that this camera may have come from."""
     import numpy as np
 
-    from calib.refine_lenses import LENSES
+    from calib.refine_lenses import LENSES, Lens
 
-    for lens in (lens for lens in LENSES if lens.model == camera.model):
-        # What a lens does not estimate stays as it starts.
-        start = lens.camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0).params
-        if np.array_equal(np.delete(start, lens.columns()), np.delete(camera.params, lens.columns())):
-            return lens.name
-    return "opencv5"
+    def may_be(lens: Lens) -> bool:
+        """Whether what it does not estimate stands as it starts."""
+        start, free = lens.camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0).params, lens.columns()
+        return np.array_equal(np.delete(start, free), np.delete(camera.params, free))
+
+    able = [lens for lens in LENSES if lens.model == camera.model and may_be(lens)]
+    return min(able, key=lambda lens: len(lens.free_names)).name if able else "opencv5"
 
 
 def _calibrated(
