@@ -7,17 +7,8 @@
     (`hand_eye_system`)
 
 A robot is not exactly where it says. All corners of a photo then err together, and photos that fit to a tenth of a
-pixel each do not fit one another; how much is estimated. View k alone says where the board is, with covariance
-σ² H_k⁻¹; against what the robot says it is off by
-
-    y_k = δ_X + Ad(X) ε_k + Ad(X G_k) δ_Z + noise,      ε_k ~ N(0, diag(σ_r², σ_t²)) in the frame of the hand
-
-a linear model whose variances σ_r (radians) and σ_t (metres) are those of the largest restricted likelihood, which
-takes into account that X and Z were fitted. Corners and robot weigh by what they are worth then, in the solution as
-well as in its covariance.
-
-Reference:
-    Patterson & Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 1971.
+pixel each do not fit one another; how much is estimated (`hand_eye_robot`). Corners and robot weigh by what they are
+worth then, in the solution as well as in its covariance.
 """
 
 from __future__ import annotations
@@ -29,15 +20,13 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import minimize as minimize_scalars
 
+from calib.hand_eye_robot import HandEyeViews, balanced, pose_information, worst_view
 from calib.hand_eye_start import closed_form, consistent_turns, motions_agree, same_unit, turned_enough
 from calib.hand_eye_system import HandEyeEstimate, HandEyeSystem
-from calib.refine_board import board_shape
 from calib.refine_fit import CalibrationConfig
 from calib.refine_reject import RejectedView
-from calib.refine_system import CalibrationSystem, Estimate
-from calib.refine_views import BoardView, Observations
+from calib.refine_views import BoardView
 from calib.rig_alone import AloneCamera, camera_alone
 from calib.rig_poses import BoardTurn, turn_of
 from calib.rig_views import RigCamera
@@ -49,12 +38,8 @@ from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 
 Setup: TypeAlias = Literal["eye_in_hand", "eye_to_hand"]
 
-_LEAST = np.array([1e-8, 1e-8])
-_MOST = np.array([0.3, 1.0])
-"""Radians and metres between which the robot's error is sought."""
 _OPEN = 0.1
 """Radians of standard deviation beyond which a rotation is not determined."""
-_ROUNDS = 3
 _FAR = 6.0
 """Standard deviations of a view's deviation from the robot's pose beyond which it is left out."""
 
@@ -152,36 +137,9 @@ def calibrate_hand_eye(
     return problem if isinstance(problem, Rejected) else _solved(problem, alone, config)
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Problem(Value):
-    """Views read from the same side, with their own poses, and what the robot says."""
-
-    board: Points3D
-    camera: Camera
-    observations: Observations
-    cams_from_board: Rigid3
-    mounts: Rigid3
-    sigma_px: float
-    turned: tuple[str, ...]
-    hand_is_mount: bool
-
-    @property
-    def many(self) -> int:
-        """Number of views."""
-        return len(self.mounts)
-
-    def of_views(self, views: list[int]) -> _Problem:
-        return dataclasses.replace(
-            self,
-            observations=self.observations.of_views(views),
-            cams_from_board=self.cams_from_board[views],
-            mounts=self.mounts[views],
-        )
-
-
 def _prepared(
     board: Points3D, alone: AloneCamera, mounts: Rigid3, config: HandEyeConfig, turns: tuple[BoardTurn, ...]
-) -> _Problem | Rejected:
+) -> HandEyeViews | Rejected:
     if len(mounts) < config.min_poses:
         told = "; ".join(f"{view.name}: {view.reason}" for view in alone.rejected[:5])
         detail = f"{len(mounts)} of {config.min_poses} needed"
@@ -201,19 +159,19 @@ def _prepared(
         return other
     observations = dataclasses.replace(o, rows=rows, board=board)
     named = tuple(o.names[v] for v in np.flatnonzero(chosen))
-    return _Problem(board, alone.camera, observations, poses, mounts, alone.sigma_px, named, in_hand)
+    return HandEyeViews(board, alone.camera, observations, poses, mounts, alone.sigma_px, named, in_hand)
 
 
-def _solved(problem: _Problem, alone: AloneCamera, config: HandEyeConfig) -> HandEyeCalibration | Rejected:
+def _solved(problem: HandEyeViews, alone: AloneCamera, config: HandEyeConfig) -> HandEyeCalibration | Rejected:
     rejected = list(alone.rejected)
     while True:
         X, Z = closed_form(problem.mounts, problem.cams_from_board)
         other = same_unit(problem.mounts, problem.cams_from_board, X)
         if other is not None:
             return other
-        information = _information(problem)
-        X, Z, sigma = _balanced(problem, information, X, Z, config.robot_sigma)
-        worst, off = _worst_view(problem, information, X, Z, sigma)
+        information = pose_information(problem)
+        X, Z, sigma = balanced(problem, information, X, Z, config.robot_sigma)
+        worst, off = worst_view(problem, information, X, Z, sigma)
         if not (config.reject and off > _FAR and problem.many > config.min_poses):
             break
         detail = f"the robot's pose is off by {off:.0f} standard deviations of the others"
@@ -230,79 +188,7 @@ def _solved(problem: _Problem, alone: AloneCamera, config: HandEyeConfig) -> Han
     return _result(problem, system, summary, covariance, sigma, rejected, config)
 
 
-def _information(problem: _Problem) -> FloatArray:
-    """(V, 6, 6) of the poses that views have by themselves, with unit noise."""
-    estimate = Estimate(
-        problem.camera,
-        problem.cams_from_board.rotation.matrix,
-        np.array(problem.cams_from_board.translation),
-        board_shape("flat", problem.board),
-    )
-    blocks = np.tril(CalibrationSystem(problem.observations, estimate, np.zeros(0, np.int64)).blocks[:, :6, :6])
-    return blocks + np.tril(blocks, -1).swapaxes(1, 2)
-
-
-def _balanced(
-    problem: _Problem, information: FloatArray, X: Rigid3, Z: Rigid3, known: tuple[float, float] | None
-) -> tuple[Rigid3, Rigid3, Vector]:
-    """X and Z by generalised least squares of the views' poses, and the robot's standard deviations (2,)."""
-    sigma = np.array(known) if known else np.array([1e-3, 1e-3])
-    for _ in range(_ROUNDS):
-        y, J, noise = _linear(problem, information, X, Z)
-        if known is None:
-            found = minimize_scalars(
-                lambda s, y=y, J=J, noise=noise: _minus_likelihood(np.exp(s), y, J, noise), np.log(sigma),
-                method="Nelder-Mead", bounds=list(zip(np.log(_LEAST), np.log(_MOST), strict=True)),
-                options={"xatol": 1e-3, "fatol": 1e-4, "maxiter": 200},
-            )  # fmt: skip
-            sigma = np.exp(found.x)
-        step = _generalised(y, J, noise, sigma)[0]
-        X, Z = Rigid3.exp(step[:6]) @ X, Rigid3.exp(step[6:]) @ Z
-    return X, Z, sigma
-
-
-def _linear(
-    problem: _Problem, information: FloatArray, X: Rigid3, Z: Rigid3
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Deviations y (V, 6) in the hand's frame, their derivatives J (V, 6, 12), covariance of the views' own noise."""
-    many = Rigid3.stack([X] * problem.many)
-    to_world = many @ problem.mounts
-    predicted = to_world @ Rigid3.stack([Z] * problem.many)
-    back = np.linalg.inv((many if problem.hand_is_mount else to_world).adjoint())
-    y = np.einsum("vij,vj->vi", back, (problem.cams_from_board @ predicted.inverse()).log())
-    J = np.concatenate([back, back @ to_world.adjoint()], axis=2)
-    return y, J, problem.sigma_px**2 * back @ np.linalg.inv(information) @ back.swapaxes(1, 2)
-
-
-def _generalised(
-    y: FloatArray, J: FloatArray, noise: FloatArray, sigma: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The solution (12,), its information (12, 12), and the covariances V_k (V, 6, 6)."""
-    V = noise + np.diag(np.repeat(sigma**2, 3))
-    weighted = np.linalg.solve(V, J)
-    information = np.einsum("vki,vkj->ij", J, weighted)
-    return np.linalg.solve(information, np.einsum("vki,vk->i", weighted, y)), information, V
-
-
-def _minus_likelihood(sigma: Vector, y: FloatArray, J: FloatArray, noise: FloatArray) -> float:
-    """−2 log of the restricted likelihood, but for a constant."""
-    step, information, V = _generalised(y, J, noise, sigma)
-    left = y - J @ step
-    fit = float(np.einsum("vk,vk->", left, np.linalg.solve(V, left[:, :, None])[:, :, 0]))
-    return fit + float(np.linalg.slogdet(V)[1].sum()) + float(np.linalg.slogdet(information)[1])
-
-
-def _worst_view(
-    problem: _Problem, information: FloatArray, X: Rigid3, Z: Rigid3, sigma: Vector
-) -> tuple[int, float]:  # fmt: skip
-    """The view that is farthest off, and by how many standard deviations of the others."""
-    y, _, noise = _linear(problem, information, X, Z)
-    V = noise + np.diag(np.repeat(sigma**2, 3))
-    lengths = np.sqrt(np.einsum("vk,vk->v", y, np.linalg.solve(V, y[:, :, None])[:, :, 0]) / 6)
-    return int(np.argmax(lengths)), float(lengths.max() / max(float(np.median(lengths)), 1e-9))
-
-
-def _system(problem: _Problem, estimate: HandEyeEstimate, robot_information: Vector) -> HandEyeSystem:
+def _system(problem: HandEyeViews, estimate: HandEyeEstimate, robot_information: Vector) -> HandEyeSystem:
     return HandEyeSystem(
         problem.observations, problem.camera, np.array(problem.board), problem.mounts, estimate,
         hand_is_mount=problem.hand_is_mount, robot_information=robot_information,
@@ -310,7 +196,7 @@ def _system(problem: _Problem, estimate: HandEyeEstimate, robot_information: Vec
 
 
 def _refined(
-    problem: _Problem, X: Rigid3, Z: Rigid3, sigma: Vector, config: HandEyeConfig
+    problem: HandEyeViews, X: Rigid3, Z: Rigid3, sigma: Vector, config: HandEyeConfig
 ) -> tuple[HandEyeSystem, Summary]:
     weights = problem.sigma_px**2 / np.repeat(sigma**2, 3)
     system = _system(problem, HandEyeEstimate(X, Z, Rigid3.identity((problem.many,))), weights)
@@ -321,7 +207,7 @@ def _refined(
 
 
 def _result(
-    problem: _Problem, system: HandEyeSystem, summary: Summary, covariance: FloatArray, sigma: Vector,
+    problem: HandEyeViews, system: HandEyeSystem, summary: Summary, covariance: FloatArray, sigma: Vector,
     rejected: list[RejectedView], config: HandEyeConfig,
 ) -> HandEyeCalibration:  # fmt: skip
     estimate, residuals = system.estimate, system.residuals()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from calib import report_svg as svg
 from calib.diagnose import board_tilts
 from calib.refine import Calibration
+from calib.refine_board import BoardShape
+from calib.refine_views import Observations
 from calib.report_svg import Frame
 from calib.uncertainty import CalibrationCovariance, uncertainty_map
 from sfm.core.arrays import FloatArray
@@ -22,12 +25,32 @@ _WORST_PART = 0.98
 """Quantile that the scale of colours ends at: single cells at the border would take it all."""
 
 
+@runtime_checkable
+class CameraResiduals(Protocol):
+    """What figures of one camera show: a `Calibration`, or one camera of a rig."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        ...
+
+    @property
+    def observations(self) -> Observations:
+        """What it saw."""
+        ...
+
+    @property
+    def residuals(self) -> FloatArray:
+        """(n, 2) projected − observed, px."""
+        ...
+
+
 def image_frame(camera: Camera) -> Frame:
     """The image, px."""
     return Frame(0.0, float(camera.width), 0.0, float(camera.height))
 
 
-def coverage_figure(found: Calibration) -> str:
+def coverage_figure(found: CameraResiduals) -> str:
     """All corners in the image; bare places are where the calibration is a guess."""
     frame = image_frame(found.camera)
     points2D = found.observations.points2D
@@ -43,7 +66,7 @@ def coverage_figure(found: Calibration) -> str:
     )  # fmt: skip
 
 
-def residual_field_figure(found: Calibration) -> str:
+def residual_field_figure(found: CameraResiduals) -> str:
     """The mean residual in cells of the image, drawn longer; a right lens model leaves arrows of any direction."""
     frame = image_frame(found.camera)
     across = max(6, min(_ACROSS, round(math.sqrt(len(found.residuals) / 12))))
@@ -104,13 +127,13 @@ def uncertainty_figure(
     )  # fmt: skip
 
 
-def board_figure(found: Calibration) -> str:
+def board_figure(shape: BoardShape) -> str:
     """Where the points of the board lie beside the design: their height by colour, arrows for the rest."""
-    points, moved = found.shape.given, found.shape.displacements * 1e3
+    points, moved = shape.given, shape.displacements * 1e3
     low, high = points[:, :2].min(0), points[:, :2].max(0)
     margin = 0.08 * float(np.max(high - low))
     frame = Frame(low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin)
-    if found.shape.kind == "flat":
+    if shape.kind == "flat":
         parts = [svg.dot(frame, x, y, 3.0, svg.ACCENT) for x, y, _ in points]
         return svg.figure(frame, "Board: taken to be flat and exactly as designed", parts)
     bottom, top = float(moved[:, 2].min()), float(moved[:, 2].max())
@@ -123,7 +146,7 @@ def board_figure(found: Calibration) -> str:
         )
         if sideways.max() > 0:
             parts.append(svg.arrow(frame, point[:2], shift[:2] * gain, svg.INK))
-    title = f"Board ({found.shape.kind}): bent by {top - bottom:.3f} mm"
+    title = f"Board ({shape.kind}): bent by {top - bottom:.3f} mm"
     if sideways.max() > 0:
         title += f", sideways at most {sideways.max():.3f} mm"
     return svg.figure(frame, title, parts, legend=svg.color_legend(frame, bottom, top, "z, mm"))

@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from calib.rig import RigCalibration
+from calib.rig_result import RigCalibration
 from sfm.core.arrays import FloatArray, Points2D, Rays, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
@@ -64,6 +64,18 @@ def epipolar_errors(found: RigCalibration, camera1: int, camera2: int) -> Epipol
         camera1, camera2, frames, int(both.sum()), math.sqrt(float(np.mean(apart**2))), float(np.abs(apart).max()),
         _row_difference(one, two, rays1, rays2, motion),
     )  # fmt: skip
+
+
+def distances_of_partners(found: RigCalibration, camera1: int, camera2: int) -> tuple[Points2D, Vector]:
+    """(n, 2) pixels in camera 2, and their signed distances (n,) from the curves of their partners in camera 1, px."""
+    pixels1, pixels2, _ = _partners(found, camera1, camera2)
+    rays1, valid1 = found.cameras[camera1].unproject(pixels1)
+    rays2, valid2 = found.cameras[camera2].unproject(pixels2)
+    both = valid1 & valid2
+    motion = found.cams_from_rig[camera2] @ found.cams_from_rig[camera1].inverse()
+    apart = distances_from_curves(found.cameras[camera2], rays1[both], rays2[both], motion)
+    known = np.isfinite(apart)
+    return pixels2[both][known], apart[known]
 
 
 def distances_from_curves(camera2: Camera, rays1: Rays, rays2: Rays, cam2_from_cam1: Rigid3) -> Vector:

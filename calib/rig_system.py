@@ -21,16 +21,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int64
 
 from calib import _refine_kernels as kernels
-from calib.refine_board import BoardShape
+from calib.rig_estimate import RigEstimate
 from calib.rig_views import RigObservations
-from sfm.core.arrays import FloatArray, Value, Vector
-from sfm.core.cameras import Camera
+from sfm.core.arrays import FloatArray, Vector
 from sfm.core.cameras._kernels import distortion_limit
-from sfm.core.geometry.rigid import Rigid3
-from sfm.core.geometry.rotation import Rotation3, skew
+from sfm.core.geometry.rotation import skew
 from sfm.core.optim.levenberg_marquardt import Trial
 from sfm.core.optim.losses import Loss, evaluate_loss, loss_id
 
@@ -41,34 +38,6 @@ _FLOOR = 1e-12
 _PIVOT = 1e-14
 """Least pivot, over the diagonal before elimination, that is not a rounding error."""
 _NO_RESIDUALS = np.zeros((0, 2))
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class RigEstimate(Value):
-    """What is estimated: cameras, `cams_from_rig` and `rigs_from_board` as rotations and translations, the board."""
-
-    cameras: tuple[Camera, ...]
-    mount_rotations: FloatArray
-    mount_translations: FloatArray
-    frame_rotations: FloatArray
-    frame_translations: FloatArray
-    shape: BoardShape
-
-    @property
-    def cams_from_rig(self) -> Rigid3:
-        """Batch (N,)."""
-        return Rigid3(Rotation3.from_matrix(self.mount_rotations), self.mount_translations)
-
-    @property
-    def rigs_from_board(self) -> Rigid3:
-        """Batch (F,)."""
-        return Rigid3(Rotation3.from_matrix(self.frame_rotations), self.frame_translations)
-
-    def of_frames(self, frames: Int64[np.ndarray, " _"]) -> RigEstimate:
-        """With the poses of these frames only."""
-        return dataclasses.replace(
-            self, frame_rotations=self.frame_rotations[frames], frame_translations=self.frame_translations[frames]
-        )
 
 
 @dataclasses.dataclass(slots=True)

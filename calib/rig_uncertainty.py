@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from calib.rig import RigCalibration
+from calib.rig_result import RigCalibration
 from calib.rig_system import RigSystem
 from calib.rig_views import RigObservations
 from sfm.core.arrays import FloatArray, Value, Vector, readonly

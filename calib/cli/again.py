@@ -25,7 +25,8 @@ from sfm.core.events import Note, Observer
 from sfm.io.camera_files import read_camera_file
 from sfm.io.camera_records import CameraRecord
 
-_SAME_PX = 1e-3
+SAME_PX = 1e-3
+"""Of cameras whose difference is not worth a word."""
 
 
 def calibrated_again(
@@ -45,8 +46,8 @@ def calibrated_again(
     made = calibrate_camera(seen, _plan(camera, record), observer=observer) if seen.views else Rejected("no_board")
     if isinstance(made, Rejected):
         raise no_camera(seen, made, sources)
-    differs = _difference(camera, made.found.camera)
-    if not differs <= _SAME_PX:
+    differs = difference_px(camera, made.found.camera)
+    if not differs <= SAME_PX:
         words = f"by {differs:.3g} px (rms over the image)" if differs == differs else "of another size"
         observer(Note(message=f"note: these photos give another camera than {path}, {words}; this one is shown"))
     return made, seen
@@ -69,7 +70,7 @@ def _plan(camera: Camera, record: CameraRecord) -> CameraPlan:
         raise ConfigError(str(error)) from error
 
 
-def _difference(camera: Camera, again: Camera) -> float:
+def difference_px(camera: Camera, again: Camera) -> float:
     """Rms over the image of where the two see the same, with frames aligned; NaN for images of different sizes."""
     if (camera.width, camera.height) != (again.width, again.height):
         return float("nan")

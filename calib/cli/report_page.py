@@ -2,34 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 
-import cv2
 import numpy as np
 
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
+from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
 from calib.diagnose import Finding
 from calib.refine import Calibration
 from sfm.core.arrays import ImageU8
 from sfm.core.errors import Rejected
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #24292f; max-width: 1180px; margin: 2em auto; padding: 0 1em }
-h1 { font-size: 1.6em; margin-bottom: 0 } h2 { font-size: 1.2em; margin-top: 2em }
-table { border-collapse: collapse } td, th { padding: .2em .9em .2em 0; text-align: right; white-space: nowrap }
-td:first-child, th:first-child { text-align: left } td.words { text-align: left; white-space: normal }
-tr + tr td { border-top: 1px solid #eaeef2 } .figures { display: flex; flex-wrap: wrap; gap: 1.2em; align-items: start }
-.finding { border-left: 4px solid #c2410c; padding: .1em .9em; margin: .6em 0; background: #fff7f0 }
-.good { border-left-color: #2a8a5b; background: #f2fbf6 } .quiet { color: #57606a } svg, img { max-width: 100% }
-"""
 _WORST_VIEWS = 3
-_PHOTO_PX = 560
-_LONGER = 40.0
-"""Times that residuals are drawn longer on photos."""
 
 
 def report_page(
@@ -52,19 +39,16 @@ def report_page(
         "<h2>Parameters</h2>", _parameters(result),
         *_ranked(result),
         "<h2>Where the photos showed the board</h2>",
-        _side_by_side([figures.coverage_figure(found), figures.tilts_figure(found)]),
+        side_by_side([figures.coverage_figure(found), figures.tilts_figure(found)]),
         "<h2>How certain a pixel is</h2>", _uncertainty(result, distance),
         "<h2>What the model does not explain</h2>",
-        _side_by_side([figures.residual_field_figure(found), figures.residual_scatter_figure(found)]),
-        _side_by_side([figures.views_figure(found), figures.board_figure(found)]),
+        side_by_side([figures.residual_field_figure(found), figures.residual_scatter_figure(found)]),
+        side_by_side([figures.views_figure(found), figures.board_figure(found.shape)]),
         *_worst(found, photos or {}),
         *_left_out(result),
         f'<p class="quiet">Parallax calib {__version__}. Pixels: the centre of the first is at (½, ½).</p>',
     ]  # fmt: skip
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(name)}</title>'
-        f"<style>{_STYLE}</style><body>{''.join(parts)}</body></html>\n"
-    )
+    return html_page(name, parts)
 
 
 def worst_views(found: Calibration) -> list[str]:
@@ -85,12 +69,7 @@ def _findings(findings: Sequence[Finding]) -> Iterator[str]:
     if not findings:
         yield '<div class="finding good">Nothing was found that speaks against this calibration.</div>'
     for finding in findings:
-        words = escape(f"{finding.cause.replace('_', ' ').capitalize()}: {finding.detail}.")
-        yield f'<div class="finding">{words}<br><span class="quiet">{escape(_sentence(finding.remedy))}</span></div>'
-
-
-def _sentence(words: str) -> str:
-    return words[:1].upper() + words[1:] + "."
+        yield finding_box(f"{finding.cause.replace('_', ' ')}: {finding.detail}", finding.remedy)
 
 
 def _quality(result: CalibratedCamera) -> str:
@@ -103,10 +82,10 @@ def _quality(result: CalibratedCamera) -> str:
         ("error on photos that were held out", held),
         ("difference between the cameras of two halves of the photos", halves),
     ):
-        known = f"not known: {given.detail or given.reason}" if isinstance(given, Rejected) else _px(given.rms_px)
+        known = f"not known: {given.detail or given.reason}" if isinstance(given, Rejected) else in_px(given.rms_px)
         rows.append((words, known))
     rows.append(("converged", "yes" if found.converged else "no"))
-    return _table([], [[label, value] for label, value in rows])
+    return table([], [[label, value] for label, value in rows])
 
 
 def _parameters(result: CalibratedCamera) -> str:
@@ -122,26 +101,22 @@ def _parameters(result: CalibratedCamera) -> str:
         '<p class="quiet">The first σ takes all corners for independent and is a lower bound; the second takes only '
         "photos for independent.</p>"
     )
-    return _table(["", "value", "σ of corners", "σ of photos"], rows) + note
+    return table(["", "value", "σ of corners", "σ of photos"], rows) + note
 
 
 def _ranked(result: CalibratedCamera) -> Iterator[str]:
     if result.lenses:
         yield "<h2>Lens models, by their error on photos that were held out</h2>"
-        yield _table(["", "training", "held out", "differs over the image by"], [
-            [lens.lens, *([_px(lens.rms_px), _px(lens.held_out_rms_px), _px(lens.differs_px)] if not lens.refused
+        yield table(["", "training", "held out", "differs over the image by"], [
+            [lens.lens, *([in_px(lens.rms_px), in_px(lens.held_out_rms_px), in_px(lens.differs_px)] if not lens.refused
              else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
-        yield _table(["", "training", "held out", "uncertainty of the camera", ""], [
-            [shape.kind, _px(shape.rms_px), _px(shape.held.rms_px if shape.held else np.nan),
-             _px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
+        yield table(["", "training", "held out", "uncertainty of the camera", ""], [
+            [shape.kind, in_px(shape.rms_px), in_px(shape.held.rms_px if shape.held else np.nan),
+             in_px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
-
-
-def _px(value: float) -> str:
-    return f"{value:.4f} px" if np.isfinite(value) else ""
 
 
 def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
@@ -150,7 +125,7 @@ def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
         return f"<p>Not known: {escape(given.detail or given.reason)}.</p>"
     found = result.found
     near = float(np.median(found.cams_from_board.translation[:, 2])) if distance is None else distance
-    return _side_by_side([
+    return side_by_side([
         figures.uncertainty_figure(found, given),
         figures.uncertainty_figure(found, given, near, f"{near:.3g} m away"),
     ])  # fmt: skip
@@ -159,44 +134,19 @@ def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
 def _worst(found: Calibration, photos: Mapping[str, ImageU8]) -> Iterator[str]:
     names = [name for name in worst_views(found) if name in photos]
     if names:
-        yield f"<h2>The worst photos</h2><p class='quiet'>Residuals are drawn {_LONGER:.0f} times as long.</p>"
-        drawn = [_with_residuals(found, name, photos[name]) for name in names]
-        yield _side_by_side([
+        yield f"<h2>The worst photos</h2><p class='quiet'>Residuals are drawn {LONGER:.0f} times as long.</p>"
+        drawn = [photo_with_residuals(found, name, photos[name]) for name in names]
+        yield side_by_side([
             f'<figure><img alt="" src="data:image/jpeg;base64,{picture}">'
             f"<figcaption>{escape(name)}</figcaption></figure>"
             for name, picture in zip(names, drawn, strict=True)
         ])  # fmt: skip
 
 
-def _with_residuals(found: Calibration, name: str, photo: ImageU8) -> str:
-    """A photo with its residuals as base64 of a JPEG."""
-    scale = min(_PHOTO_PX / photo.shape[1], 1.0)
-    small = cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    picture = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR) if small.ndim == 2 else np.ascontiguousarray(small[:, :, ::-1])
-    mine = found.observations.view_of == found.observations.names.index(name)
-    for at, residual in zip(found.observations.points2D[mine], found.residuals[mine], strict=True):
-        start, end = (at - 0.5) * scale, (at - 0.5 + _LONGER * residual) * scale
-        first, last = ((round(float(x)), round(float(y))) for x, y in (start, end))
-        cv2.line(picture, first, last, (12, 65, 234), 1, cv2.LINE_AA)
-        cv2.circle(picture, first, 2, (196, 98, 11), -1, cv2.LINE_AA)
-    return base64.b64encode(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1].tobytes()).decode()
-
-
 def _left_out(result: CalibratedCamera) -> Iterator[str]:
     if result.left_out:
         yield "<h2>Photos that were left out</h2>"
         rows = [[view.name, view.reason.replace("_", " "), view.detail] for view in result.left_out]
-        yield _table(["", "reason", ""], rows, words=True)
+        yield table(["", "reason", ""], rows, words=True)
     if corners := len(result.found.rejected_corners):
         yield f"<p>{corners} single corners were left out as well.</p>"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: bool = False) -> str:
-    cell = '<td class="words">' if words else "<td>"
-    lines = ["<tr>" + "".join(f"<th>{escape(name)}</th>" for name in head) + "</tr>"] if head else []
-    lines += ["<tr>" + "".join(f"{cell}{escape(value)}</td>" for value in row) + "</tr>" for row in rows]
-    return f"<table>{''.join(lines)}</table>"
-
-
-def _side_by_side(parts: Sequence[str]) -> str:
-    return f'<div class="figures">{"".join(parts)}</div>'

@@ -10,7 +10,8 @@ from typing import Annotated
 import tyro
 
 from calib.cli.parsing import parsed
-from calib.cli.rigging import CommonOptions, named_sources, run
+from calib.cli.rig_options import CommonOptions, named_sources
+from calib.cli.rigging import run
 from sfm.core.errors import ConfigError
 
 EXAMPLES = (

@@ -13,9 +13,9 @@ import numpy as np
 from calib import __version__
 from calib.boards import Board
 from calib.cli.calibrating import Sightings
-from calib.rig import RigCalibration
 from calib.rig_epipolar import EpipolarErrors, epipolar_errors
 from calib.rig_frames import FrameTable
+from calib.rig_result import RigCalibration
 from calib.rig_shapes import RankedRig
 from calib.rig_uncertainty import RelativeUncertainty, RigCovariance, relative_uncertainty, rig_covariance
 from sfm.core.errors import Rejected
@@ -23,10 +23,14 @@ from sfm.core.scene import CameraRig
 from sfm.io.rig_files import MountedSigmas, RigFile
 
 _SHOWN = 12
+GIVEN = "given"
+"""In place of a lens, in the file of a rig: the camera was known before."""
 
 
-def rig_record(ranked: RankedRig, seen: Mapping[str, Sightings], board: Board, command: str) -> RigFile:
-    """What goes to the disk."""
+def rig_record(
+    ranked: RankedRig, seen: Mapping[str, Sightings], table: FrameTable, board: Board, command: str
+) -> RigFile:
+    """What goes to the disk: the rig, and what it takes to make it again from its photos."""
     found = _found(ranked)
     covariances = rig_covariance(found)
     facts: dict[str, str | int | float | bool] = {
@@ -38,11 +42,24 @@ def rig_record(ranked: RankedRig, seen: Mapping[str, Sightings], board: Board, c
         "sigma_px": found.sigma_px,
         "converged": found.converged,
         **({"holdout_rms_px": ranked.held.rms_px} if ranked.held else {}),
+        "paired_by": table.by,
+        **_intrinsics(found),
         **{f"photos_{name}": f"{one.count}, digest {one.digest}" for name, one in seen.items()},
     }
     rig = CameraRig(found.names, found.cameras, found.cams_from_rig, found.names[0])
     sigmas = () if isinstance(covariances, Rejected) else tuple(_sigmas(found, covariances))
     return RigFile(rig, found.rms_px, sigmas, facts)
+
+
+def _intrinsics(found: RigCalibration) -> dict[str, str | bool]:
+    """By which lenses cameras were calibrated, and what was held."""
+    alone = [one.calibration for one in found.alone]
+    refined = [bool(names) for names in found.free_names]
+    return {
+        "held": any(one and not free for one, free in zip(alone, refined, strict=True)),
+        "given_refined": any(one is None and free for one, free in zip(alone, refined, strict=True)),
+        **{f"lens_{name}": one.lens if one else GIVEN for name, one in zip(found.names, alone, strict=True)},
+    }
 
 
 def _sigmas(found: RigCalibration, covariances: RigCovariance) -> Iterator[MountedSigmas]:
@@ -158,7 +175,7 @@ def rig_lines(ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table:
     yield f"rms {found.rms_px:.4f} px{held}; board {found.shape.kind}{_bend(found)}; {_converged(found)}"
     yield from _shape_lines(ranked)
     yield from _left_out_lines(found, seen)
-    yield from (f"note: {words}" for words in (*found.fallbacks, *_remarks(found)))
+    yield from (f"note: {words}" for words in (*found.fallbacks, *rig_remarks(found)))
 
 
 def _frame_lines(found: RigCalibration, table: FrameTable) -> Iterator[str]:
@@ -253,7 +270,7 @@ def _left_out_lines(found: RigCalibration, seen: Mapping[str, Sightings]) -> Ite
             yield f"{name}: read the board from its other end in {frames}, which was undone"
 
 
-def _remarks(found: RigCalibration) -> Iterator[str]:
+def rig_remarks(found: RigCalibration) -> Iterator[str]:
     """What may be a mistake of the hand."""
     if found.names[:2] == ("left", "right") and len(found.names) == 2:
         motion = found.cams_from_rig[1]

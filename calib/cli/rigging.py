@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-import glob
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from calib.cli.parsing import Flag, board_of
-from sfm.core.errors import ConfigError, ExitCode, InputError, ReconstructionError, Rejected
+from calib.cli.rig_options import AUTO, CommonOptions, checked, known_cameras, lenses_of
+from sfm.core.errors import ExitCode, ReconstructionError, Rejected
 
 if TYPE_CHECKING:
     from calib.boards import Board
@@ -21,7 +17,6 @@ if TYPE_CHECKING:
     from calib.rig_views import RigCamera
     from sfm.core.cameras import Camera
 
-AUTO = "auto"
 _REMEDIES = {
     "cameras_not_connected": "take frames that show the board to cameras of both groups",
     "cameras_disagree": "see docs/calibrate_rigs.md; --pair says how photos are paired",
@@ -31,56 +26,10 @@ _REMEDIES = {
     "undetermined_focal": "tilt the board by 15° to 45° about two axes, or give the camera by --camera NAME=FILE",
 }
 
-Many = tyro.conf.UseAppendAction[tuple[str, ...]]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CommonOptions:
-    """Options of all commands for rigs."""
-
-    board: Annotated[str, tyro.conf.arg(metavar="BOARD", help_behavior_hint="(required)")]
-    """The .toml that `calib board` wrote, or the board in one word such as chessboard:9x6:25mm (inner corners, side of
-    a square); see `calib detect --help`."""
-
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="(required)")]
-    """Rig file to write, .toml."""
-
-    model: Annotated[str, tyro.conf.arg(metavar="NAME")] = AUTO
-    """Lens model of all cameras: auto (of each what predicts held-out photos best), pinhole, opencv, opencv5, opencv8,
-    fisheye, eucm …; or of some of them, as in left=opencv5,top=fisheye."""
-
-    camera: Annotated[Many, tyro.conf.arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)")] = ()
-    """A camera that is calibrated already, such as left=left.toml. It is held."""
-
-    refine_known: Flag = False
-    """Refines cameras given by --camera as well."""
-
-    hold: Flag = False
-    """Holds all cameras as each of them comes out alone; only the poses are found together."""
-
-    shape: Annotated[str, tyro.conf.arg(metavar="NAME")] = AUTO
-    """What the board may be: flat, scale, paraboloid, height, free, or auto: what predicts held-out frames best."""
-
-    pair: Annotated[str, tyro.conf.arg(metavar="HOW")] = AUTO
-    """How photos of one moment are told: stem (same name but for the suffix), number (same number in the name), order
-    (first with first, if all have as many), or auto: stem or number, what pairs more."""
-
-    json: Flag = False
-    """Everything as JSON."""
-
-    no_cache: Flag = False
-    """Looks for the board anew, and keeps nothing."""
-
-    seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0
-    """Of the choice of photos that are held out."""
-
-    threads: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 0)")] = 0
-    """At most so many photos at once; 0 for all cores. The result does not depend on it."""
-
 
 def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int:
     """Photos of the cameras in `sources`, by name a folder or pattern each, to a rig file and a report on stdout."""
-    board, files = _checked(options, sources)
+    board, files = checked(options, sources)
 
     from calib.cli.progress import kernels_announced, told
     from calib.cli.rig_report import rig_json, rig_lines, rig_record
@@ -89,12 +38,12 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
 
     observer = told()
     with kernels_announced(observer):
-        seen, table = see_rig(files, board, options)
+        seen, table = see_rig(files, board, pair=options.pair, threads=options.threads, cached=not options.no_cache)
         cameras = rig_cameras(seen, files, table, options)
         ranked = _calibrated(board, cameras, board_turns(board), options)
     if isinstance(ranked, Rejected):
-        raise _refusal(ranked, seen)
-    write_rig_file(options.output, rig_record(ranked[0], seen, board, command))
+        raise rig_refused(ranked, seen)
+    write_rig_file(options.output, rig_record(ranked[0], seen, table, board, command))
     if options.json:
         import json
 
@@ -104,108 +53,14 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
     return ExitCode.OK
 
 
-def named_sources(words: Sequence[str]) -> dict[str, str]:
-    """Folders or patterns by the names of cameras: what NAME=SOURCE says, else what tells their paths apart.
-
-    Raises:
-        ConfigError: two have one name.
-    """
-    given = [word.partition("=") if "=" in word and not Path(word).exists() else ("", "", word) for word in words]
-    parts = [_parts_of(source) for _, _, source in given]
-    shortest = min(map(len, parts), default=0)
-    at = next((k for k in range(1, shortest + 1) if len({part[-k] for part in parts}) == len(parts)), 1)
-    sources: dict[str, str] = {}
-    for (name, _, source), part in zip(given, parts, strict=True):
-        name = name or (part[-at] if part else source)
-        if name in sources:
-            raise ConfigError(f"two cameras are called {name!r}", remedy=f"say NAME={source}")
-        sources[name] = source
-    return sources
-
-
-def _parts_of(source: str) -> tuple[str, ...]:
-    """Of a folder; of a pattern such as photos/left*.jpg with what comes before the first star."""
-    path = Path(source)
-    if not any(sign in path.name for sign in "*?["):
-        return tuple(part for part in path.parts if part not in ("/", ".", ".."))
-    stem = path.name[: min(path.name.find(sign) for sign in "*?[" if sign in path.name)].strip("_-. ")
-    return (*(part for part in path.parent.parts if part not in ("/", ".", "..")), stem or path.name)
-
-
-def _checked(options: CommonOptions, sources: Mapping[str, str]) -> tuple[Board, dict[str, tuple[Path, ...]]]:
-    """What the options say wrongly is told before photos are looked at."""
-    from calib.refine_board import SHAPES
-    from calib.rig_frames import PAIRINGS
-
-    if options.threads < 0:
-        raise ConfigError(f"--threads must not be negative, got {options.threads}")
-    if options.output.suffix.lower() != ".toml":
-        raise ConfigError(f"-o must end in .toml, got {options.output}")
-    for option, value, known in (("shape", options.shape, (AUTO, *SHAPES)), ("pair", options.pair, PAIRINGS)):
-        if value not in known:
-            raise ConfigError(f"unknown --{option} {value!r}", remedy=f"known are {', '.join(known)}")
-    lenses_of(options, tuple(sources))
-    files = {name: _expanded(source) for name, source in sources.items()}
-    known_cameras(options, tuple(sources))
-    return board_of(options.board), files
-
-
-def _expanded(source: str) -> tuple[Path, ...]:
-    path = Path(source)
-    if path.exists() or not any(sign in source for sign in "*?["):
-        return (path,)
-    found = sorted(glob.glob(source))
-    if not found:
-        raise InputError("no file is called so", path=source, remedy="name a folder, or a pattern in quotes")
-    return tuple(Path(name) for name in found)
-
-
-def lenses_of(options: CommonOptions, names: tuple[str, ...]) -> dict[str, str]:
-    """The lens model of each camera by --model.
-
-    Raises:
-        ConfigError: a camera or a model is unknown.
-    """
-    from calib.refine_lenses import lens_called
-
-    chosen = dict.fromkeys(names, AUTO)
-    for word in options.model.split(","):
-        name, equals, called = word.rpartition("=")
-        if equals and name not in names:
-            raise ConfigError(f"--model: there is no camera {name!r}", remedy=f"cameras are {', '.join(names)}")
-        try:
-            lens = AUTO if called.lower() == AUTO else lens_called(called).name
-        except ValueError as error:
-            raise ConfigError(str(error)) from error
-        chosen |= {name: lens} if equals else dict.fromkeys(names, lens)
-    return chosen
-
-
-def known_cameras(options: CommonOptions, names: tuple[str, ...]) -> dict[str, Camera]:
-    """Cameras by --camera.
-
-    Raises:
-        ConfigError: an unknown name, or a file with several cameras; InputError: a file does not do.
-    """
-    from sfm.io.camera_files import read_intrinsics
-
-    known = {}
-    for word in options.camera:
-        name, equals, file = word.partition("=")
-        if not equals or name not in names:
-            raise ConfigError(f"--camera {word}: expected NAME=FILE with a NAME of {', '.join(names)}")
-        cameras = read_intrinsics(Path(file))
-        if len(cameras) != 1:
-            raise ConfigError(f"holds {len(cameras)} cameras, one is needed", path=file)
-        known[name] = next(iter(cameras.values()))
-    return known
-
-
 def see_rig(
-    files: Mapping[str, tuple[Path, ...]], board: Board, options: CommonOptions
+    files: Mapping[str, tuple[Path, ...]], board: Board, *, pair: str, threads: int, cached: bool = True
 ) -> tuple[dict[str, Sightings], FrameTable]:
     """What each camera sees of the board, and which photos belong together.
 
+    Args:
+        pair: one of `rig_frames.PAIRINGS`.
+        cached: takes detections that are kept, and keeps new ones.
     Raises:
         ReconstructionError: photos cannot be paired.
     """
@@ -214,9 +69,8 @@ def see_rig(
     from calib.cli.refusals import no_board
     from calib.rig_frames import pair_photos
 
-    cached = not options.no_cache
     seen = {
-        name: see_board(paths, board, threads=options.threads, use_cache=cached, observer=told())
+        name: see_board(paths, board, threads=threads, use_cache=cached, observer=told())
         for name, paths in files.items()
     }
     for name, one in seen.items():
@@ -226,11 +80,11 @@ def see_rig(
     for name, one in seen.items():
         if one.digest in digests:
             refusal = Rejected("same_photos", f"{digests[one.digest]} and {name} are the very same photos")
-            raise _refusal(refusal, seen)
+            raise rig_refused(refusal, seen)
         digests[one.digest] = name
-    table = pair_photos({name: _names(one) for name, one in seen.items()}, options.pair)  # pyright: ignore
+    table = pair_photos({name: _names(one) for name, one in seen.items()}, pair)  # pyright: ignore
     if isinstance(table, Rejected):
-        raise _refusal(table, seen)
+        raise rig_refused(table, seen)
     return seen, table
 
 
@@ -250,7 +104,7 @@ def rig_cameras(
 
     names = tuple(seen)
     lenses, known = lenses_of(options, names), known_cameras(options, names)
-    lenses |= {name: _lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
+    lenses |= {name: lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
     lenses |= _chosen({name: one for name, one in seen.items() if lenses[name] == AUTO}, files, options.seed)
     return [
         RigCamera(
@@ -293,16 +147,25 @@ def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]]
     return {name: alike(name) for name in found}
 
 
-def _lens_of(camera: Camera) -> str:
-    from calib.refine_lenses import LENSES
+def lens_of(camera: Camera) -> str:
+    """The lens with the fewest coefficients that this camera may have come from."""
+    import numpy as np
 
-    return next((lens.name for lens in LENSES if lens.model == camera.model), "opencv5")
+    from calib.refine_lenses import LENSES, Lens
+
+    def may_be(lens: Lens) -> bool:
+        """Whether what it does not estimate stands as it starts."""
+        start, free = lens.camera(camera.width, camera.height, 1.0, 1.0, 0.0, 0.0).params, lens.columns()
+        return np.array_equal(np.delete(start, free), np.delete(camera.params, free))
+
+    able = [lens for lens in LENSES if lens.model == camera.model and may_be(lens)]
+    return min(able, key=lambda lens: len(lens.free_names)).name if able else "opencv5"
 
 
 def _calibrated(
     board: Board, cameras: Sequence[RigCamera], turns: Sequence[object], options: CommonOptions
 ) -> tuple[RankedRig, ...] | Rejected:
-    from calib.rig import RigConfig
+    from calib.rig_result import RigConfig
     from calib.rig_shapes import CANDIDATES, choose_rig_shape
 
     config = RigConfig(refine_intrinsics=not options.hold, refine_known=options.refine_known)
@@ -310,7 +173,8 @@ def _calibrated(
     return choose_rig_shape(board.points3D, cameras, config, turns=turns, shapes=shapes, seed=options.seed)  # pyright: ignore
 
 
-def _refusal(why: Rejected, seen: Mapping[str, Sightings]) -> ReconstructionError:
+def rig_refused(why: Rejected, seen: Mapping[str, Sightings]) -> ReconstructionError:
+    """The error for photos that give no rig."""
     remedy = _REMEDIES.get(why.reason, "look at `calib detect` for each camera, and see docs/calibrate_rigs.md")
     counts = ", ".join(f"{name} {len(one.views)} of {one.count}" for name, one in seen.items())
     return ReconstructionError(f"{why.reason}: {why.detail} (photos with the board: {counts})", remedy=remedy)

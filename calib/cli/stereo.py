@@ -10,7 +10,8 @@ from typing import Annotated
 import tyro
 
 from calib.cli.parsing import parsed
-from calib.cli.rigging import CommonOptions, run
+from calib.cli.rig_options import CommonOptions
+from calib.cli.rigging import run
 
 EXAMPLES = (
     "calib stereo left right --board chessboard:9x6:25mm -o rig.toml",

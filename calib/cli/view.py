@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,29 +13,29 @@ from calib.cli.parsing import Flag, parsed
 from sfm.core.errors import ConfigError, ExitCode, ImageError
 
 if TYPE_CHECKING:
-    from calib.boards import Board
-    from calib.cli.calibrating import CalibratedCamera
+    from sfm.core.arrays import ImageU8
+    from sfm.core.events import Observer
     from sfm.viz.rerun_boards import BoardScene
 
 EXAMPLES = (
     "calib view camera.toml photos",
     "calib view camera.toml photos --save boards.rrd",
     "calib view camera.toml photos --web",
+    "calib view rig.toml left right",
 )
-_WORST_SIGMAS = 4.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """Boards as they stood before the camera, photos and residuals in the Rerun viewer; nothing leaves this machine."""
+    """Boards as they stood before the cameras, photos and residuals, in the Rerun viewer; all stays on this machine."""
 
-    camera: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")]
-    """Camera file that `calib camera` wrote."""
+    camera: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE", help_behavior_hint="")]
+    """What `calib camera`, `calib stereo` or `calib rig` wrote."""
 
     images: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="IMAGES", help_behavior_hint="")]
-    """The photos that it was made from, or their folders."""
+    """The photos that it was made from, or their folders; of a rig [NAME=]DIR or a pattern for each camera."""
 
-    board: Annotated[str, tyro.conf.arg(metavar="BOARD", help_behavior_hint="(default: that of the camera file)")] = ""
+    board: Annotated[str, tyro.conf.arg(metavar="BOARD", help_behavior_hint="(default: that of the file)")] = ""
     """What is in the photos."""
 
     save: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
@@ -56,25 +56,20 @@ def main(words: Sequence[str]) -> int:
     if not options.images:
         raise ConfigError("no photos are named", remedy="name the folder of photos after the camera file")
 
-    from calib.cli.again import calibrated_again
-    from calib.cli.photos import photos_of
-    from calib.cli.progress import kernels_announced, told
-    from sfm.core.arrays import ImageU8
+    from calib.cli.progress import told
+    from sfm.io.rig_files import is_rig_file
     from sfm.viz.rerun_boards import log_boards
 
-    observer = told()
-    with kernels_announced(observer):
-        made, seen = calibrated_again(
-            options.camera, options.images, options.board, threads=options.threads, observer=observer
-        )
+    scene, files = (_rig if is_rig_file(options.camera) else _camera)(options, told())
 
     def photo(camera: str, name: str) -> ImageU8:
-        found = photos_of(options.images, [name])
+        from calib.cli.photos import photos_of
+
+        found = photos_of(files[camera], [name])
         if name not in found:
             raise ImageError("is not there any more", path=name)
         return found[name]
 
-    scene = scene_of(options.camera.stem, made, seen.board)
     show = not (options.save or options.web)
     log_boards(scene, photo, save=options.save, web=options.web, spawn=show, announce=lambda at: print(at, flush=True))
     if options.save:
@@ -82,33 +77,26 @@ def main(words: Sequence[str]) -> int:
     return ExitCode.OK
 
 
-def scene_of(name: str, made: CalibratedCamera, board: Board | None) -> BoardScene:
-    """The calibration as a scene whose world is the camera's frame."""
-    import numpy as np
+def _camera(options: ViewOptions, observer: Observer) -> tuple[BoardScene, Mapping[str, Sequence[Path]]]:
+    """The scene, and of each camera the photos or their folders."""
+    from calib.cli.again import calibrated_again
+    from calib.cli.progress import kernels_announced
+    from calib.cli.scenes import camera_scene
 
-    from sfm.core.geometry.rigid import Rigid3
-    from sfm.viz.rerun_boards import BoardPhoto, BoardScene, grid_lines
+    with kernels_announced(observer):
+        made, seen = calibrated_again(
+            options.camera, options.images, options.board, threads=options.threads, observer=observer
+        )
+    name = options.camera.stem
+    return camera_scene(name, made, seen.board), {name: options.images}
 
-    found = made.found
-    views, offsets = found.observations, found.observations.offsets
-    photos = tuple(
-        (BoardPhoto(name, shown, views.points2D[a:b], found.residuals[a:b]),)
-        for shown, a, b in zip(views.names, offsets[:-1], offsets[1:], strict=True)
-    )
-    columns, rows = board.grid if board is not None else (0, 0)
-    lines = grid_lines(columns, rows) if board is not None else np.zeros((0, 2), np.int64)
-    if board is not None and board.kind == "aprilgrid":
-        corners = 4 * np.arange(board.columns * board.rows)[:, None]
-        lines = np.concatenate([np.stack([corners + k, corners + (k + 1) % 4], 2)[:, 0] for k in range(4)])
-    told = "\n".join(f"- {finding.cause.replace('_', ' ')}: {finding.detail}" for finding in made.findings)
-    return BoardScene(
-        cameras={name: found.camera},
-        cams_from_world=Rigid3.identity((1,)),
-        points3D=found.shape.points3D,
-        lines=lines,
-        worlds_from_board=found.cams_from_board,
-        photos=photos,
-        names=views.names,
-        worst_px=_WORST_SIGMAS * found.sigma_px,
-        report=f"# {name}\n\n{found.camera.model}, rms {found.rms_px:.4f} px, {len(views)} photos\n\n{told}\n",
-    )
+
+def _rig(options: ViewOptions, observer: Observer) -> tuple[BoardScene, Mapping[str, Sequence[Path]]]:
+    from calib.cli.progress import kernels_announced
+    from calib.cli.rig_again import rig_again
+    from calib.cli.scenes import rig_scene
+
+    with kernels_announced(observer):
+        words = [str(source) for source in options.images]
+        made = rig_again(options.camera, words, options.board, threads=options.threads, observer=observer)
+    return rig_scene(options.camera.stem, made), made.files

@@ -6,10 +6,8 @@ A format is known by name: parallax (`.toml`), colmap (`.txt`, `.bin`), opencv, 
 from __future__ import annotations
 
 import dataclasses
-import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +16,7 @@ from sfm.core.errors import ConfigError, FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import CameraRig
 from sfm.io import colmap_binary, colmap_text
-from sfm.io.atomic import atomic_path, os_errors, write_chunks, write_text
+from sfm.io.atomic import atomic_path, write_chunks, write_text
 from sfm.io.camera_files import read_intrinsics, write_camera_toml
 from sfm.io.camera_foreign import FOREIGN_SUFFIXES, foreign_format, read_foreign_cameras
 from sfm.io.camera_kalibr import kalibr_text
@@ -26,6 +24,7 @@ from sfm.io.camera_nerfstudio import nerfstudio_text
 from sfm.io.camera_opencv import opencv_text
 from sfm.io.camera_ros import ros_text
 from sfm.io.camera_set import CameraSet
+from sfm.io.camera_tables import toml_document
 from sfm.io.rig_files import RigFile, read_rig_file, write_rig_file
 
 _BY_SUFFIX = {".toml": "parallax", ".txt": "colmap", ".bin": "colmap", ".json": "nerfstudio"}
@@ -171,12 +170,7 @@ def _check(found: tuple[Reread, ...]) -> None:
 
 def _read_toml(path: Path) -> CameraSet:
     """A rig file, or a camera file with the name that it gives its camera."""
-    with os_errors(path):
-        content = path.read_bytes()
-    try:
-        document: Mapping[str, Any] = tomllib.loads(content.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FormatError(f"is no TOML: {error}", path=path) from error
+    document = toml_document(path)
     if "rig" in document:
         rig = read_rig_file(path).rig
         return CameraSet(rig.names, rig.cameras, rig.cams_from_rig, rig.unit)

@@ -27,7 +27,6 @@ import dataclasses
 import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -38,12 +37,12 @@ from jaxtyping import Float64
 
 from sfm.core.arrays import Value, Vector, readonly
 from sfm.core.cameras import Camera
-from sfm.core.errors import ConfigError, FormatError
+from sfm.core.errors import ConfigError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import CameraRig
-from sfm.io.atomic import os_errors, write_text
-from sfm.io.camera_files import camera_from_table
+from sfm.io.atomic import write_text
+from sfm.io.camera_tables import camera_from_table, toml_document
 
 Fact: TypeAlias = str | int | float | bool
 _FURTHER = ("rotation", "translation", "sigma_params", "sigma_rotation", "sigma_translation")
@@ -91,6 +90,16 @@ class RigFile(Value):
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
 
+def is_rig_file(path: Path | str) -> bool:
+    """Whether a calibration file is that of a rig.
+
+    Raises:
+        InputError: the file cannot be opened.
+        FormatError: it is no TOML.
+    """
+    return "rig" in toml_document(Path(path))
+
+
 def read_rig_file(path: Path | str) -> RigFile:
     """The rig of a `.toml`; focal lengths count as measured.
 
@@ -100,12 +109,7 @@ def read_rig_file(path: Path | str) -> RigFile:
         ConfigError: a table or key is unknown, missing or out of its range.
     """
     path = Path(path)
-    with os_errors(path):
-        content = path.read_bytes()
-    try:
-        document = tomllib.loads(content.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise FormatError(f"is no TOML: {error}", path=path) from error
+    document = toml_document(path)
     _known(document, ("rig", "camera"), "", path)
     head, tables = document.get("rig"), document.get("camera")
     if not isinstance(head, dict) or not isinstance(tables, list) or not tables:

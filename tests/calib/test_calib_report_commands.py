@@ -7,7 +7,7 @@ import pytest
 
 from calib.boards import aprilgrid
 from calib.cli.again import calibrated_again
-from calib.cli.view import scene_of
+from calib.cli.scenes import board_lines, camera_scene
 from sfm.core.errors import ConfigError
 from sfm.core.events import SILENT, Note
 from sfm.io.camera_files import write_camera_toml
@@ -79,7 +79,7 @@ def test_the_scene_has_the_boards_where_the_calibration_has_them(calibrated):
     made, seen = calibrated_again(
         calibrated / "c.toml", [calibrated / "corners.json"], "", threads=1, observer=SILENT
     )  # fmt: skip
-    scene = scene_of("left", made, seen.board)
+    scene = camera_scene("left", made, seen.board)
     found = made.found
     for v, (photo,) in enumerate(scene.photos):
         corners = scene.worlds_from_board[v] @ scene.points3D
@@ -90,12 +90,9 @@ def test_the_scene_has_the_boards_where_the_calibration_has_them(calibrated):
     np.testing.assert_allclose(lengths, 0.03)
 
 
-def test_tags_are_drawn_as_squares(calibrated):
-    made, _ = calibrated_again(
-        calibrated / "c.toml", [calibrated / "corners.json"], "", threads=1, observer=SILENT
-    )  # fmt: skip
+def test_tags_are_drawn_as_squares():
     board = aprilgrid(3, 2, 0.08, 0.02)
-    lines = scene_of("left", made, board).lines
+    lines = board_lines(board)
     lengths = np.linalg.norm(np.diff(board.points3D[lines], axis=1), axis=2)
     assert len(lines) == 4 * 6
     np.testing.assert_allclose(lengths, 0.08)

@@ -73,7 +73,7 @@ def test_means_over_cells_are_those_of_the_corners_in_them(rng):
 
 
 def test_the_board_figure_tells_the_bend_in_millimetres(found):
-    drawing = figures.board_figure(found)
+    drawing = figures.board_figure(found.shape)
     heights = [float(dot[0].text.split()[1]) for dot in parts(drawing, "circle") if len(dot)]
     np.testing.assert_allclose(heights, 1e3 * found.shape.displacements[:, 2], atol=6e-4)
 

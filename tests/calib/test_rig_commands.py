@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.boards import chessboard
-from calib.cli.rigging import named_sources
+from calib.cli.rig_options import named_sources
 from calib.cli.robot_poses import read_robot_poses
 from sfm.core.errors import ConfigError, FormatError
 from sfm.core.geometry.rigid import Rigid3
