@@ -66,6 +66,7 @@ class _Point:
     translations: FloatArray
     costs: FloatArray
     blocks: FloatArray
+    cost: float = math.nan
 
 
 class CalibrationSystem:
@@ -90,6 +91,7 @@ class CalibrationSystem:
         self._loss = loss_id(loss), float(loss_scale)
         self._lost = 0.5 * float(evaluate_loss(loss, np.array(_LOST_PX**2), loss_scale)[0])
         self._keep_invertible, self._caution = keep_invertible, caution
+        self._board = np.array(estimate.shape.points3D)
         views, shared = len(observations), len(self._columns) + self._basis.shape[2]
         self._now = self._place(
             estimate.camera.params, estimate.shape.coefficients, estimate.rotations, estimate.translations
@@ -100,6 +102,7 @@ class CalibrationSystem:
         self._S, self._by_pose, self._by_shared = (
             np.empty((shared + 1, shared + 1)), np.empty((views, 6)), np.empty(shared),
         )  # fmt: skip
+        self._diagonal, self._shared_diagonal, self._slope = np.empty((views, 6)), np.empty(shared), math.nan
 
     @property
     def shared_count(self) -> int:
@@ -132,47 +135,39 @@ class CalibrationSystem:
 
     def linearize(self) -> tuple[float, float]:
         """Cost and largest entry of the gradient at the current parameters."""
-        blocks = self._now.blocks
-        diagonal = np.diagonal(blocks, axis1=1, axis2=2)
-        gradient = blocks[:, -1, :-1]
-        floor = _FLOOR * diagonal[:, :6].max(initial=0.0)
-        self._diagonal = self._caution * np.maximum(diagonal[:, :6], floor)
-        shared = diagonal[:, 6:-1].sum(0)
-        self._shared_diagonal = self._caution * np.where(shared > 0, shared, 1.0)
-        self._gradient = gradient[:, :6], gradient[:, 6:].sum(0)
-        largest = max(float(np.abs(part).max(initial=0.0)) for part in self._gradient)
-        return float(self._now.costs.sum()), largest
+        largest = kernels.scale_views(
+            self._now.blocks, _FLOOR, self._caution, self._diagonal, self._shared_diagonal
+        )  # fmt: skip
+        return self._now.cost, largest
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves by the solution and evaluates there."""
-        now, trial = self._now, self._trial
-        if not kernels.solve_views(
-            now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, self._by_pose,
-            self._by_shared,
-        ):  # fmt: skip
-            return None
-        by_pose, by_shared, free = self._by_pose, self._by_shared, len(self._columns)
-        square = float(np.vdot(by_pose, by_pose) + by_shared @ by_shared)
+        now, trial, free = self._now, self._trial, len(self._columns)
+        square, slope, damped = self._solve(damping)
         if not math.isfinite(square):
             return None
-        kernels.move_poses(now.rotations, now.translations, by_pose, trial.rotations, trial.translations)
+        moved = kernels.move_poses(
+            now.rotations, now.translations, self._by_pose, trial.rotations, trial.translations
+        )  # fmt: skip
         trial.params, trial.coefficients = now.params.copy(), now.coefficients.copy()
-        trial.params[self._columns] += by_shared[:free]
+        trial.params[self._columns] += self._by_shared[:free]
         if self._basis.shape[2]:
-            trial.coefficients += by_shared[free:]
+            trial.coefficients += self._by_shared[free:]
         self._evaluate(trial)
-        damped = float(np.vdot(self._diagonal, by_pose**2) + self._shared_diagonal @ by_shared**2)
-        slope = float(np.vdot(self._gradient[0], by_pose) + self._gradient[1] @ by_shared)
-        norm = math.sqrt(float(np.vdot(now.translations, now.translations) + now.params @ now.params))
-        return Trial(float(trial.costs.sum()), 0.5 * (damping * damped - slope), math.sqrt(square), norm)
+        norm = math.sqrt(moved + float(now.params @ now.params))
+        return Trial(trial.cost, 0.5 * (damping * damped - slope), math.sqrt(square), norm)
+
+    def _solve(self, damping: float) -> tuple[float, float, float]:
+        return kernels.solve_views(
+            self._now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, self._by_pose,
+            self._by_shared,
+        )  # fmt: skip
 
     def shared_inverse(self) -> FloatArray | None:
         """S⁻¹ (K, K) at the current parameters, None where they are not determined."""
         self.linearize()
-        if not kernels.solve_views(
-            self._now.blocks, self._diagonal, self._shared_diagonal, 0.0, self._L, self._Y, self._S, self._by_pose,
-            self._by_shared,
-        ):  # fmt: skip
+        self._slope = self._solve(0.0)[1]
+        if math.isnan(self._slope):
             return None
         count = self.shared_count
         root = solve_triangular(self._S[:count, :count], np.eye(count), lower=True)
@@ -182,7 +177,7 @@ class CalibrationSystem:
         """What one more undamped step promises to take off the cost; inf where there is no such step."""
         if self.shared_inverse() is None:
             return math.inf
-        return -0.5 * float(np.vdot(self._gradient[0], self._by_pose) + self._gradient[1] @ self._by_shared)
+        return -0.5 * self._slope
 
     def is_at_minimum(self, cost: float) -> bool:
         """Whether one more undamped step promises less than a billionth of the cost."""
@@ -206,13 +201,10 @@ class CalibrationSystem:
     def _evaluate(self, point: _Point, residuals: FloatArray = _NO_RESIDUALS) -> None:
         o, model = self.observations, self._camera.model_info.model_id
         limit = distortion_limit(model, point.params) ** 2 if self._keep_invertible else -math.inf
-        board = self._shape.given
+        board = self._board
         if self._basis.shape[2]:
-            board = board + self._shape.basis @ point.coefficients
-        elif len(self._shape.coefficients):
-            board = self._shape.points3D
-        kernels.evaluate_views(
+            board = self._shape.given + self._shape.basis @ point.coefficients
+        point.cost = kernels.evaluate_views(
             model, point.params, self._columns, limit, point.rotations, point.translations, o.offsets, o.rows,
-            np.array(board), self._basis, o.points2D, o.roots, *self._loss, self._lost, point.costs,
-            point.blocks, residuals,
+            board, self._basis, o.points2D, o.roots, *self._loss, self._lost, point.costs, point.blocks, residuals,
         )  # fmt: skip

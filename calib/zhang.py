@@ -243,10 +243,10 @@ def _implausible(fx: float, fy: float, cx: float, cy: float, width: int, height:
 
 
 def _try_focal_lengths(observations: Observations, lens: Lens) -> Start | Rejected:
-    """The trial focal length whose rays fit homographies best, in px."""
+    """The trial focal length whose rays fit homographies best, in px, by some corners of some views."""
     width, height = observations.width, observations.height
     some = np.unique(np.linspace(0, len(observations) - 1, _VIEWS_TRIED).astype(int)).tolist()
-    views, best = observations.of_views(some), (math.inf, 0.0)
+    views, best = _thinned(observations.of_views(some)), (math.inf, 0.0)
     for focal in _TRIALS * max(width, height):
         camera = lens.camera(width, height, focal, focal, width / 2, height / 2)
         R, t, errors = poses_of_views(views, camera)
