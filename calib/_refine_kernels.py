@@ -16,8 +16,25 @@ from numba import njit
 
 from sfm.core.cameras._kernels import MAX_PARAMS, _scale_and_offset
 from sfm.core.cameras._lane_kernels import (
-    _A, _A_DISTORTED, _B, _B_DISTORTED, _D, _G, _S, BY_PARAMS, BY_POINT, LANES, OK, U, V, X, Y, Z, fill_by_param,
-    is_perspective, project_lanes,
+    _A,
+    _A_DISTORTED,
+    _B,
+    _B_DISTORTED,
+    _D,
+    _G,
+    _S,
+    BY_PARAMS,
+    BY_POINT,
+    LANES,
+    OK,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    fill_by_param,
+    is_perspective,
+    project_lanes,
 )  # fmt: skip
 from sfm.core.cameras._lane_kernels import ROWS as _CAMERA_ROWS
 from sfm.core.optim._loss_kernels import TRIVIAL, loss_and_weight
@@ -267,7 +284,7 @@ def _column(rows_of, k, w):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
-    """Fills D, `factor` times the diagonal of H but never zero, for `solve_views`; returns the gradient's largest entry.
+    """Fills D, `factor` times the diagonal of H but never zero, for `solve_views`; returns the largest |gradient|.
 
     A pose's part is at least `floor` of the largest of all poses.
     """
@@ -297,7 +314,7 @@ def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
 def solve_views(blocks, diagonal, shared_diagonal, damping, L, Y, S, by_pose, by_shared):
     """Solves (H + λD) δ = −g with the poses eliminated; returns δᵀδ, gᵀδ and δᵀDδ.
 
-    They are NaN where the matrix is not positive definite. `diagonal` (V, 6) and `shared_diagonal` (K,) are D. Fills the
+    NaN where the matrix is not positive definite. `diagonal` (V, 6) and `shared_diagonal` (K,) are D. Fills the
     steps (V, 6) and (K,), the factors L (V, 6, 6) of the poses' blocks, Y = L⁻¹ [W | g] (V, 6, K + 1) and the factor
     of the reduced matrix in the lower triangle of S (K + 1, K + 1).
     """

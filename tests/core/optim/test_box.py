@@ -68,6 +68,31 @@ def test_a_step_meets_the_conditions_of_a_minimum(rng):
     assert seen == {-1, 0, 1}
 
 
+def test_ill_conditioned_boxes_end_without_an_entry_that_would_leave_its_edge():
+    held = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        size = int(rng.integers(4, 30))
+        J = rng.normal(size=(size + 5, size)) * 10.0 ** rng.uniform(-3, 3, size)
+        J = J @ (np.eye(size) + 0.99 * rng.normal(size=(size, size)))
+        scale = np.sqrt(np.sum(J**2, 0))
+        A, b = J.T @ J / scale / scale[:, None] + 1e-8 * np.eye(size), rng.normal(size=size)
+        reach = rng.uniform(0.01, 0.5, size) * np.abs(np.linalg.solve(A, b)).mean()
+        step = solved(A, b, Box(np.arange(size), -reach, reach))
+        assert np.all(step.multipliers * step.sides <= 0)
+        assert np.all(np.abs(step.x) <= reach * (1 + 1e-12))
+        held += int(np.sum(step.sides != 0))
+    assert held > 300
+
+
+def test_a_matrix_that_is_not_positive_definite_gives_nan():
+    def inverse_column(k: int) -> np.ndarray:
+        return np.array([[1.0, 2.0], [2.0, 1.0]])[k] * (-1) ** k
+
+    step = step_in_box(np.array([5.0, 5.0]), inverse_column, Box(np.arange(2), -np.ones(2), np.ones(2)))
+    assert np.isnan(step.x).all() or np.all(np.abs(step.x) <= 1)
+
+
 def test_a_step_within_the_box_is_taken_as_it_is(rng):
     A, b = quadratic(rng, 12)
     x = np.linalg.solve(A, b)
