@@ -12,6 +12,8 @@ _REASONS = {
     "relative_cost": "a full step hardly lowered the cost",
     "gradient": "the gradient vanished (residuals are perpendicular to what parameters do to them)",
     "step": "steps became as small as rounding errors",
+    "no_decrease": "NOT CONVERGED: no step lowers the cost, though the gradient has not vanished: an observation is "
+    "on the edge of what its lens can show; free fewer parameters, or bound them",
     "max_iterations": "NOT CONVERGED: the limit of iterations was reached",
     "no_free_parameters": "nothing was free to change",
 }

@@ -34,18 +34,23 @@ import numpy as np
 
 from sfm.core.arrays import FloatArray
 
-StopReason: TypeAlias = Literal["relative_cost", "gradient", "step", "max_iterations", "no_free_parameters"]
+StopReason: TypeAlias = Literal[
+    "relative_cost", "gradient", "step", "no_decrease", "max_iterations", "no_free_parameters"
+]
 
 _INITIAL_DAMPING = 1e-4
 _LEAST_FACTOR, _LEAST_FACTOR_OF_EXACT, _EXACT = 0.2, 0.04, 0.005
 _MIN_DAMPING, _MAX_DAMPING = 1e-10, 1e20
 """Less changes no step, but rounding makes a matrix indefinite in directions that are free, as those of a scene are:
 with 1e-16 robust losses take up to twice the steps."""
-_FREE_DAMPING = 1.0
-"""Above it a step is less than half of the undamped one, and a small decrease says nothing."""
+_FREE_DAMPING, _NEARLY_UNDAMPED = 1.0, 1e-6
+"""Above the one a step is less than half of the undamped one in every direction, and a small decrease says nothing.
+Above the other it may still be in directions of which the residuals tell little: two in a row must be small."""
 _MIN_GAIN = 1e-3
 _RELATIVE_STEP = 1e-14
 """Steps below this part of the parameters' norm are rounding."""
+_FLAT = 1e-6
+"""Where it is steeper than this and yet no step lowers the cost, this does not go on from here: `no_decrease`."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -133,7 +138,7 @@ def minimize(system: System, rules: StopRules) -> Summary:
     if gradient == 0:
         return Summary.at_once("gradient", cost, gradient)
     table = list(Summary.at_once("max_iterations", cost, gradient).iterations)
-    damping, growth = _INITIAL_DAMPING, 2.0
+    damping, growth, nearly = _INITIAL_DAMPING, 2.0, False
     for _ in range(rules.max_iterations):
         used, trial = damping, system.try_step(damping)
         if trial is not None and trial.steepness <= rules.gradient_tolerance:
@@ -142,7 +147,9 @@ def minimize(system: System, rules: StopRules) -> Summary:
         if accepted and trial is not None:
             system.accept()
             cost = trial.cost
-        reason = _stop(rules, cost, change, used, trial)
+        ended = _stop(rules, cost, change, used, trial)
+        reason = None if ended == "relative_cost" and used > _NEARLY_UNDAMPED and not nearly else ended
+        nearly = ended == "relative_cost"
         if accepted and reason is None:
             cost, gradient = system.linearize()
             reason = "gradient" if gradient == 0 else None
@@ -182,5 +189,6 @@ def _stop(rules: StopRules, cost: float, change: float, damping: float, trial: T
     if damping <= _FREE_DAMPING and abs(change) <= small and trial.predicted_decrease <= small:
         return "relative_cost"
     if trial.step_norm <= _RELATIVE_STEP * trial.parameter_norm or damping > _MAX_DAMPING:
-        return "step"
+        stuck = not trial.cost < cost and _FLAT < trial.steepness < math.inf
+        return "no_decrease" if stuck else "step"
     return None

@@ -135,6 +135,22 @@ def test_a_system_that_never_solves_ends_with_its_reason():
     assert np.array_equal(system.x, start)
 
 
+def test_a_wall_that_the_gradient_points_to_is_no_convergence():
+    edge = Curve(lambda x: np.where(x < 1, np.nan, np.array([x[0], 1.0])), lambda x: np.array([[1.0], [0.0]]), [1.0])
+    summary = minimize(edge, StopRules(max_iterations=200))
+    assert summary.reason == "no_decrease"
+    assert edge.x == 1.0
+
+
+def test_a_small_step_that_is_damped_does_not_end_the_loop_alone():
+    """Two columns nearly alike: with damping 1e-4 the difference of their parameters hardly moves."""
+    J = np.array([[1.0, 1.0], [0.0, 3e-3], [0.0, 0.0]])
+    valley = Curve(lambda x: J @ x + [0.0, 1.0, 100.0], lambda x: J, [0.0, 0.0])
+    summary = minimize(valley, StopRules(relative_cost_tolerance=1e-4))
+    assert valley.J @ valley.x + [0.0, 1.0, 0.0] == pytest.approx(np.zeros(3), abs=0.5)
+    assert len(summary.iterations) == 3
+
+
 def test_a_trial_that_is_not_finite_is_never_accepted():
     system = decay()
     honest, calls = system.try_step, []
