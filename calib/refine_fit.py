@@ -26,7 +26,7 @@ _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
 _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tolerance=0.0)
 _SEEDED = StopRules(max_iterations=60, relative_cost_tolerance=1e-7, gradient_tolerance=0.0)
-_POSES = StopRules(max_iterations=10, relative_cost_tolerance=1e-6, gradient_tolerance=0.0)
+_POSES = StopRules(max_iterations=5, relative_cost_tolerance=1e-3, gradient_tolerance=0.0)
 _PATIENT = StopRules(max_iterations=300, relative_cost_tolerance=1e-6, gradient_tolerance=0.0)
 _SLOW = Damping(least=1e-30, least_factor=1 / 3, least_factor_of_exact=1 / 3)
 """With the usual fall three times as many trials of `Lens.at_once` end above OpenCV's, and they take more steps."""
@@ -164,8 +164,8 @@ def solve_from_start(
 ) -> tuple[CalibrationSystem, Summary] | Rejected:
     """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once`.
 
-    A minimum that is reached at once is taken for the right one. Otherwise the parameters are released in stages as
-    well, and the lower cost wins.
+    A minimum that is reached at once is taken for the right one. Where `keep_invertible` holds the solution back, it
+    depends on the way where that happens: the parameters are released in stages as well, and the lower cost wins.
     """
     first = None
     if fit.lens.at_once and not fit.has_gross_errors(homographies.errors):
@@ -173,7 +173,7 @@ def solve_from_start(
         if not isinstance(estimate, Rejected):
             first = fit.solve(observations, estimate)
             system, summary = first
-            if system.is_at_minimum(summary.final_cost):
+            if not fit.config.keep_invertible or system.is_at_minimum(summary.final_cost):
                 return first
     estimate = fit.seed(observations, homographies.errors)
     if isinstance(estimate, Rejected):

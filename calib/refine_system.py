@@ -34,6 +34,8 @@ _FLOOR = 1e-12
 """Least diagonal of the damping, over the largest of its kind."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
+RIDGE = 1e-12
+"""Damping that makes a matrix definite in which coefficients of a lens are not determined, and changes nothing else."""
 _LOCAL = 1e-4
 """Part of the cost that a step takes off, below which it teaches something of the second derivative."""
 _NO_STEP = (math.nan, math.nan, math.nan)
@@ -187,7 +189,7 @@ class CalibrationSystem:
         """S⁻¹ (K, K) at the current parameters, None where they are not determined; with so much damping, if wanted."""
         self.linearize()
         self._bends = self._learns = False
-        self._slope = self._solve(ridge)[1]
+        self._slope = self._solve(ridge / self._caution)[1]
         if math.isnan(self._slope):
             return None
         count = self.shared_count
@@ -195,8 +197,8 @@ class CalibrationSystem:
         return root.T @ root
 
     def newton_decrement(self) -> float:
-        """What one more undamped step promises to take off the cost; inf where there is no such step."""
-        if self.shared_inverse() is None:
+        """What one more step, all but undamped, promises to take off the cost; inf where there is no such step."""
+        if self.shared_inverse() is None and self.shared_inverse(RIDGE) is None:
             return math.inf
         return -0.5 * self._slope
 
