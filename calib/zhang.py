@@ -140,7 +140,7 @@ def intrinsics_from_homographies(
 
 
 def centred_focal_lengths(matrices: FloatArray, width: int, height: int) -> tuple[float, float] | None:
-    """fx, fy in px from homographies (V, 3, 3) with the principal point at the centre of the image, None if implausible.
+    """fx, fy in px from homographies (V, 3, 3) if the principal point is the image's centre; None if not believed.
 
     Each pair of orthogonal directions of a board, along its sides and along its diagonals, gives an equation of unit
     directions, so that boards seen from afar weigh as much as those nearby. This is where OpenCV starts from.
