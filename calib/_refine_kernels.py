@@ -35,13 +35,15 @@ from sfm.core.cameras._lane_kernels import (
     fill_by_param,
     is_perspective,
     project_lanes,
-)  # fmt: skip
+)
 from sfm.core.cameras._lane_kernels import ROWS as _CAMERA_ROWS
 from sfm.core.optim._loss_kernels import TRIVIAL, loss_and_weight
 
 POSE = 6
 _PIVOT = 1e-14
 """Least pivot, over the diagonal before elimination, that is not a rounding error."""
+_LEAST_GROWTH = 1e-3
+"""Of the gradient along a step, over what the reduced matrix promises, below which a step teaches nothing."""
 _ROOT = _CAMERA_ROWS
 """Three rows: the root of the information, upper triangular, times that of the robust weight."""
 _COLUMNS = _ROOT + 3
@@ -284,7 +286,7 @@ def _column(rows_of, k, w):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
-    """Fills D, `factor` times the diagonal of H but never zero, for `solve_views`; returns the largest |gradient|.
+    """Fills D, `factor` times the diagonal of H but never zero; returns the largest entry of the gradient.
 
     A pose's part is at least `floor` of the largest of all poses.
     """
@@ -311,36 +313,76 @@ def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_views(blocks, diagonal, shared_diagonal, damping, L, Y, S, by_pose, by_shared):
-    """Solves (H + λD) δ = −g with the poses eliminated; returns δᵀδ, gᵀδ and δᵀDδ.
+def eliminate_views(blocks, diagonal, damping, L, Y, S):
+    """Takes the poses out of (H + λD) δ = −g; False where a pose's block is not positive definite.
 
-    NaN where the matrix is not positive definite. `diagonal` (V, 6) and `shared_diagonal` (K,) are D. Fills the
-    steps (V, 6) and (K,), the factors L (V, 6, 6) of the poses' blocks, Y = L⁻¹ [W | g] (V, 6, K + 1) and the factor
-    of the reduced matrix in the lower triangle of S (K + 1, K + 1).
+    `diagonal` (V, 6) are the poses' part of D. Fills the factors L (V, 6, 6) of the blocks, Y = L⁻¹ [W | g]
+    (V, 6, K + 1) and the lower triangle of S (K + 1, K + 1): the reduced matrix, not yet damped, its gradient last.
+    """
+    S[:] = 0.0
+    definite = True
+    for view in range(len(blocks)):
+        definite = _eliminate(blocks[view], diagonal[view], damping, L[view], Y[view], S) and definite
+    return definite
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bend_by_secant(S, step, gradient, bend):
+    """Corrects `bend` (K, K), what the reduced matrix lacks of the second derivative, by a step of what is shared.
+
+    The step (K,) led here from where the reduced gradient was `gradient` (K,). The symmetric update of Dennis, Gay and
+    Welsch, with their sizing; it is left out where the gradient did not grow along the step.
+    """
+    count = len(step)
+    grown, lacking, known = np.empty(count), np.empty(count), np.empty(count)
+    along, curved, expected, promised = 0.0, 0.0, 0.0, 0.0
+    for i in range(count):
+        grown[i] = S[count, i] - gradient[i]
+        linear, known[i] = 0.0, 0.0
+        for j in range(count):
+            linear += (S[i, j] if j <= i else S[j, i]) * step[j]
+            known[i] += bend[i, j] * step[j]
+        lacking[i] = grown[i] - linear
+        along += grown[i] * step[i]
+        curved += lacking[i] * step[i]
+        expected += known[i] * step[i]
+        promised += linear * step[i]
+    size = min(1.0, abs(curved) / abs(expected)) if expected != 0.0 else 1.0
+    inner = curved - size * expected
+    for i in range(count):
+        for j in range(count):
+            bend[i, j] *= size
+            if along > _LEAST_GROWTH * promised:
+                first, second = lacking[i] - size * known[i], lacking[j] - size * known[j]
+                bend[i, j] += (first * grown[j] + grown[i] * second - inner / along * grown[i] * grown[j]) / along
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_views(blocks, diagonal, shared_diagonal, damping, L, Y, S, bend, F, by_pose, by_shared):
+    """Solves what `eliminate_views` left, with `bend` (K, K) added; returns δᵀδ, gᵀδ and δᵀDδ.
+
+    They are NaN where the matrix is not positive definite. Fills the steps (V, 6) and (K,) and the factor of the damped
+    reduced matrix in the lower triangle of F (K + 1, K + 1).
     """
     shared = len(by_shared)
-    S[:] = 0.0
-    for view in range(len(blocks)):
-        if not _eliminate(blocks[view], diagonal[view], damping, L[view], Y[view], S):
-            return math.nan, math.nan, math.nan
     for j in range(shared):
+        least = _PIVOT * (S[j, j] + damping * shared_diagonal[j])
         for i in range(j, shared + 1):
-            s = S[i, j] + (damping * shared_diagonal[j] if i == j else 0.0)
-            before = s
+            s = S[i, j] + (damping * shared_diagonal[j] if i == j else 0.0) + (bend[i, j] if i < shared else 0.0)
             for m in range(j):
-                s -= S[i, m] * S[j, m]
+                s -= F[i, m] * F[j, m]
             if i == j:
-                if not s > _PIVOT * before:
+                if not s > least:
                     return math.nan, math.nan, math.nan
-                S[j, j] = math.sqrt(s)
+                F[j, j] = math.sqrt(s)
             else:
-                S[i, j] = s / S[j, j]
+                F[i, j] = s / F[j, j]
     square, slope, damped = 0.0, 0.0, 0.0
     for j in range(shared - 1, -1, -1):
-        s = -S[shared, j]
+        s = -F[shared, j]
         for m in range(j + 1, shared):
-            s -= S[m, j] * by_shared[m]
-        by_shared[j] = s / S[j, j]
+            s -= F[m, j] * by_shared[m]
+        by_shared[j] = s / F[j, j]
         square += by_shared[j] ** 2
         damped += shared_diagonal[j] * by_shared[j] ** 2
     for view in range(len(blocks)):
@@ -363,7 +405,7 @@ def solve_views(blocks, diagonal, shared_diagonal, damping, L, Y, S, by_pose, by
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _eliminate(H, diagonal, damping, L, Y, S):
-    """Factor and couplings of one pose; S gains what the view tells of what is shared. False: not definite."""
+    """Factor and couplings of a pose; S gains what the view tells of what is shared. False: not definite."""
     columns = len(S)
     for j in range(POSE):
         for i in range(j, POSE):

@@ -34,6 +34,11 @@ _FLOOR = 1e-12
 """Least diagonal of the damping, over the largest of its kind."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
+RIDGE = 1e-12
+"""Damping that makes a matrix definite in which coefficients of a lens are not determined, and changes nothing else."""
+_LOCAL = 1e-4
+"""Part of the cost that a step takes off, below which it teaches something of the second derivative."""
+_NO_STEP = (math.nan, math.nan, math.nan)
 _NO_RESIDUALS = np.zeros((0, 2))
 
 
@@ -78,11 +83,14 @@ class CalibrationSystem:
         keep_invertible: lets no observation lie where the distortion cannot be inverted.
         caution: factor of the damping. A rational distortion is nearly undetermined in some directions, in which even
             the loop's first damping, small as it is, holds back for tens of steps; near the minimum none is needed.
+        by_secant: near the minimum, what the normal matrix lacks of the second derivative is learnt from the steps. In
+            directions that are nearly undetermined it lacks half or more, and steps overshoot for tens of times.
     """
 
     def __init__(
         self, observations: Observations, estimate: Estimate, columns: np.ndarray, *, free_shape: bool = False,
         loss: Loss = "trivial", loss_scale: float = 1.0, keep_invertible: bool = True, caution: float = 1.0,
+        by_secant: bool = False,
     ) -> None:  # fmt: skip
         self.observations, self._camera, self._shape = observations, estimate.camera, estimate.shape
         self._columns = np.asarray(columns, np.int64)
@@ -99,9 +107,12 @@ class CalibrationSystem:
         self._trial = self._place(np.zeros(0), np.zeros(0), np.empty((views, 3, 3)), np.empty((views, 3)))
         self._evaluate(self._now)
         self._L, self._Y = np.zeros((views, 6, 6)), np.empty((views, 6, shared + 1))
-        self._S, self._by_pose, self._by_shared = (
-            np.empty((shared + 1, shared + 1)), np.empty((views, 6)), np.empty(shared),
-        )  # fmt: skip
+        self._S, self._F = np.empty((shared + 1, shared + 1)), np.zeros((shared + 1, shared + 1))
+        self._by_pose, self._by_shared = np.empty((views, 6)), np.empty(shared)
+        # What is lacking of the second derivative, nothing, and the last step with the reduced gradient before it.
+        self._bend, self._straight = np.zeros((shared, shared)), np.zeros((shared, shared))
+        self._last = np.zeros(shared), np.zeros(shared)
+        self._by_secant, self._bends, self._learns = by_secant, False, False
         self._diagonal, self._shared_diagonal, self._slope = np.empty((views, 6)), np.empty(shared), math.nan
 
     @property
@@ -158,24 +169,36 @@ class CalibrationSystem:
         return Trial(trial.cost, 0.5 * (damping * damped - slope), math.sqrt(square), norm)
 
     def _solve(self, damping: float) -> tuple[float, float, float]:
-        return kernels.solve_views(
-            self._now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, self._by_pose,
-            self._by_shared,
-        )  # fmt: skip
+        """Squared length of the step, its slope and its damped square; NaN where there is none."""
+        now = self._now
+        if not kernels.eliminate_views(now.blocks, self._diagonal, damping, self._L, self._Y, self._S):
+            return _NO_STEP
+        if self._learns:
+            self._learns = False
+            kernels.bend_by_secant(self._S, *self._last, self._bend)
+        for bend in (self._bend, self._straight) if self._bends else (self._straight,):
+            found = kernels.step_views(
+                now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, bend, self._F,
+                self._by_pose, self._by_shared,
+            )  # fmt: skip
+            if math.isfinite(found[0]):
+                return found
+        return _NO_STEP
 
-    def shared_inverse(self) -> FloatArray | None:
-        """S⁻¹ (K, K) at the current parameters, None where they are not determined."""
+    def shared_inverse(self, ridge: float = 0.0) -> FloatArray | None:
+        """S⁻¹ (K, K) at the current parameters, None where they are not determined; with so much damping, if wanted."""
         self.linearize()
-        self._slope = self._solve(0.0)[1]
+        self._bends = self._learns = False
+        self._slope = self._solve(ridge / self._caution)[1]
         if math.isnan(self._slope):
             return None
         count = self.shared_count
-        root = solve_triangular(self._S[:count, :count], np.eye(count), lower=True)
+        root = solve_triangular(self._F[:count, :count], np.eye(count), lower=True)
         return root.T @ root
 
     def newton_decrement(self) -> float:
-        """What one more undamped step promises to take off the cost; inf where there is no such step."""
-        if self.shared_inverse() is None:
+        """What one more step, all but undamped, promises to take off the cost; inf where there is no such step."""
+        if self.shared_inverse() is None and self.shared_inverse(RIDGE) is None:
             return math.inf
         return -0.5 * self._slope
 
@@ -183,15 +206,16 @@ class CalibrationSystem:
         """Whether one more undamped step promises less than a billionth of the cost."""
         return self.newton_decrement() <= _CONVERGED * cost + _EXACT * len(self.observations.rows)
 
-    def is_invertible(self) -> bool:
-        """Whether all corners lie where the distortion can be inverted."""
-        o, now = self.observations, self.estimate
-        points = now.rotations[o.view_of] @ now.shape.points3D[o.rows][:, :, None]
-        return bool(np.all(now.camera.project(points[:, :, 0] + now.translations[o.view_of])[1]))
-
     def accept(self) -> None:
         """Makes the last trial current."""
         self._now, self._trial = self._trial, self._now
+        if not self._by_secant:
+            return
+        self._learns = self._bends = self._trial.cost - self._now.cost <= _LOCAL * self._trial.cost
+        if self._bends:
+            self._last[0][:], self._last[1][:] = self._by_shared, self._S[-1, :-1]
+        else:
+            self._bend[:] = 0.0
 
     def _place(self, params: FloatArray, coefficients: FloatArray, R: FloatArray, t: FloatArray) -> _Point:
         views, width = len(self.observations), 7 + len(self._columns) + self._basis.shape[2]
