@@ -12,6 +12,7 @@ import numpy as np
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
+from calib.cli.camera_report import would_bring
 from calib.diagnose import Finding
 from calib.refine import Calibration
 from sfm.core.arrays import ImageU8
@@ -132,12 +133,14 @@ def _ranked(result: CalibratedCamera) -> Iterator[str]:
             [lens.lens, *([_px(lens.rms_px), _px(lens.held_out_rms_px), _px(lens.differs_px)] if not lens.refused
              else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
+        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.lenses))
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
         yield _table(["", "training", "held out", "uncertainty of the camera", ""], [
             [shape.kind, _px(shape.rms_px), _px(shape.held.rms_px if shape.held else np.nan),
              _px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
+        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.shapes))
 
 
 def _px(value: float) -> str:
