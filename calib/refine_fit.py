@@ -126,10 +126,10 @@ class Fit:
 def solve_by_stages(
     fit: Fit, observations: Observations, errors: Vector
 ) -> tuple[CalibrationSystem, Summary] | Rejected:
-    """Least squares from the start; see `Lens.rival` for the second attempt that some lenses have.
+    """Least squares from the start; see `Lens` for the second attempt that some have, of which the lower cost wins.
 
-    A minimum that is reached, and at which the distortion can be inverted at all corners, is taken for the right one.
-    Otherwise the parameters are released in the other order as well, and the lower cost wins.
+    With `rival` a minimum that is reached, and at which the distortion can be inverted at all corners, is taken for the
+    right one; otherwise the parameters are released in the other order as well.
 
     Args:
         errors: of the views' homographies.
@@ -138,14 +138,25 @@ def solve_by_stages(
     if isinstance(estimate, Rejected):
         return estimate
     system, summary = fit.solve(observations, estimate)
-    if not fit.lens.rival or (system.is_at_minimum(summary.final_cost) and system.is_invertible()):
+    rival = _rival_of(fit, system, summary)
+    if rival is None:
         return system, summary
-    rival = dataclasses.replace(fit, lens=dataclasses.replace(fit.lens, stages=fit.lens.rival))
     estimate = rival.seed(observations, errors)
     if isinstance(estimate, Rejected):
         return system, summary
     other, also = rival.solve(observations, estimate)
     return (other, also) if also.final_cost < summary.final_cost else (system, summary)
+
+
+def _rival_of(fit: Fit, system: CalibrationSystem, summary: Summary) -> Fit | None:
+    """The second attempt, where the lens has one and needs it."""
+    lens, start = fit.lens, fit.start
+    if lens.other_shape:
+        lens, camera = lens.from_other_shape(start.camera)
+        return dataclasses.replace(fit, lens=lens, start=dataclasses.replace(start, camera=camera))
+    if not lens.rival or (system.is_at_minimum(summary.final_cost) and system.is_invertible()):
+        return None
+    return dataclasses.replace(fit, lens=dataclasses.replace(lens, stages=lens.rival))
 
 
 def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:
