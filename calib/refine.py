@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from calib.refine_board import BoardShape, board_shape
 from calib.refine_checks import check_determined
-from calib.refine_fit import CalibrationConfig, Fit, solve_by_stages, turned_back
+from calib.refine_fit import CalibrationConfig, Fit, solve_from_start, turned_back
 from calib.refine_lenses import lens_by_name
 from calib.refine_reject import RejectedView, reject_outliers, sort_out
 from calib.refine_system import CalibrationSystem, Estimate
@@ -120,7 +120,7 @@ def calibrate(
     shown = np.bincount(observations.rows, minlength=len(board))
     shape = board_shape(config.shape, observations.board, shown >= 2)
     fit = Fit(lens, config, start, shape)
-    solved = solve_by_stages(fit, observations, homographies.errors)
+    solved = solve_from_start(fit, observations, homographies)
     if isinstance(solved, Rejected):
         return solved
     system, summary = solved

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib.refine_fit import Fit
-from calib.refine_system import CalibrationSystem
+from calib.refine_system import RIDGE, CalibrationSystem
 from calib.zhang import largest_angle_between
 from sfm.core.arrays import FloatArray
 from sfm.core.errors import Rejected
@@ -88,6 +88,9 @@ def _without_spare(fit: Fit, system: CalibrationSystem) -> Checked | Rejected:
 def _deviations(system: CalibrationSystem, summary: Summary, names: Sequence[str]) -> dict[str, float]:
     """Standard deviation of each free parameter, inf where nothing determines them."""
     inverse = system.shared_inverse()
+    if inverse is None:
+        # Coefficients of the lens may be open and the focal length not; with the ridge what is open is very uncertain.
+        inverse = system.shared_inverse(RIDGE)
     freedom = max(2 * len(system.observations.rows) - 6 * len(system.observations) - system.shared_count, 1)
     noise = 2 * summary.final_cost / freedom
     if inverse is None:

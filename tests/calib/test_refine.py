@@ -103,6 +103,28 @@ def test_a_smooth_fisheye_is_seen_by_a_model_with_two_shape_parameters(rng):
     assert abs(found.camera.mean_focal_length / FISHEYE.mean_focal_length - 1) < 0.01
 
 
+@pytest.mark.parametrize(("xi", "alpha"), [(-0.3, 0.55), (-0.1, 0.58), (0.25, 0.66), (0.5, 0.6)])
+def test_a_double_sphere_is_found_on_either_side_of_the_unified_camera(xi, alpha, rng):
+    camera = Camera("DOUBLE_SPHERE", 1280, 960, np.array([400 * (1 + xi), 402 * (1 + xi), 644, 473, xi, alpha]))
+    found = calibrated(views_of(camera, rng, noise_px=0.0), CalibrationConfig(lens="double_sphere"))
+    assert found.rms_px < 1e-9
+    np.testing.assert_allclose(found.camera.params, camera.params, rtol=1e-5)
+
+
+def test_a_unified_camera_leaves_xi_of_a_double_sphere_open_and_is_found():
+    camera = Camera("DOUBLE_SPHERE", 1280, 960, np.array([400, 402, 644, 473, 0.0, 0.6]))
+    found = calibrated(views_of(camera, np.random.default_rng(0)), CalibrationConfig(lens="double_sphere"))
+    assert found.fallbacks == ("xi is held at 0: the photos do not tell it from the focal length",)
+    assert "xi" not in found.free_names
+    np.testing.assert_allclose(found.camera.params, camera.params, rtol=2e-3)
+
+
+def test_a_double_sphere_sees_a_fisheye_about_as_well_as_the_enhanced_unified_model(rng):
+    views = views_of(FISHEYE, rng)
+    spheres, unified = (calibrated(views, CalibrationConfig(lens=lens)) for lens in ("double_sphere", "eucm"))
+    assert spheres.sigma_px < 1.5 * unified.sigma_px
+
+
 def test_the_noise_is_measured_free_of_what_parameters_absorb(rng):
     measured = [calibrated(views_of(LENS, rng, count=5, noise_px=0.2)).sigma_px for _ in range(12)]
     assert np.mean(measured) == pytest.approx(0.2, rel=0.03)
