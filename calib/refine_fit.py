@@ -174,13 +174,23 @@ def solve_from_start(
     estimate = fit.seed(observations, homographies.errors)
     if isinstance(estimate, Rejected):
         return first or estimate
-    second = fit.solve(observations, estimate)
-    return second if first is None or second[1].final_cost < first[1].final_cost else first
+    attempts = (first, fit.solve(observations, estimate), _with_other_shape(fit, observations, homographies.errors))
+    return min((one for one in attempts if one is not None), key=lambda one: one[1].final_cost)
 
 
 def _spread_over(views: int, most: int) -> list[int]:
     """Some views, or all where there are not many."""
     return sorted(set(np.linspace(0, views - 1, min(views, most)).astype(int).tolist()))
+
+
+def _with_other_shape(fit: Fit, observations: Observations, errors: Vector) -> tuple[CalibrationSystem, Summary] | None:
+    """From the other start, where the lens has one."""
+    if not fit.lens.other_shape:
+        return None
+    lens, camera = fit.lens.from_other_shape(fit.start.camera)
+    other = dataclasses.replace(fit, lens=lens, start=dataclasses.replace(fit.start, camera=camera))
+    estimate = other.seed(observations, errors)
+    return None if isinstance(estimate, Rejected) else other.solve(observations, estimate)
 
 
 def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:

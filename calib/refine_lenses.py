@@ -18,6 +18,11 @@ photos can bear has several minima, where a pole and a zero lie side by side amo
 depends on the way: with all coefficients released at once from none, by steps that are damped until they bring little,
 32 of 34 trials on real and rendered corners end no higher than with OpenCV, which goes that way as well. By stages it
 is 26.
+
+Of a double sphere f, ξ and α do the same to the image near ξ = 0: with d the distance of a point, all three move it by
+a combination of d and z alone. So it cannot start there, and for each minimum with ξ < 0 there is nearly another with
+ξ > 0; where the best ξ is 0, which is the unified camera, it is held there, as photos do not tell it from the focal
+length.
 """
 
 from __future__ import annotations
@@ -42,6 +47,8 @@ class Lens:
         start: "perspective" is found by Zhang's closed form, "wide" by trying focal lengths.
         shape: start of parameters that do not start at zero.
         at_once: all is released at once first, and stages are for where that finds no minimum.
+        other_shape: another start of these, beyond which the cost has another minimum.
+        spare: parameters that are held, and at what, where the views leave them open.
     """
 
     name: str
@@ -50,6 +57,8 @@ class Lens:
     start: Literal["perspective", "wide"] = "perspective"
     shape: tuple[tuple[str, float], ...] = ()
     at_once: bool = False
+    other_shape: tuple[tuple[str, float], ...] = ()
+    spare: tuple[tuple[str, float], ...] = ()
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -63,12 +72,20 @@ class Lens:
         return np.flatnonzero([name in free for name in model_by_name(self.model).param_names])
 
     def camera(self, width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera:
-        """The camera with these focal lengths and principal point, px, and no distortion."""
+        """The camera with these focal lengths on its axis and principal point, px, and no distortion."""
         camera = infer_camera(self.model, width, height)
-        values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **dict(self.shape)}
+        shape = dict(self.shape)
+        fx, fy = (f * (1 + shape.get("xi", 0.0)) for f in (fx, fy))
+        values = {"f": (fx + fy) / 2, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **shape}
         names = camera.model_info.param_names
         params: Vector = np.array([values.get(name, old) for name, old in zip(names, camera.params, strict=True)])
         return camera.with_params(params)
+
+    def from_other_shape(self, camera: Camera) -> tuple[Lens, Camera]:
+        """The lens that starts with the other shape, and its camera for one that starts with this one's."""
+        other = dataclasses.replace(self, shape=self.other_shape, other_shape=())
+        fx, fy = (f / (1 + dict(self.shape).get("xi", 0.0)) for f in camera.focal_lengths)
+        return other, other.camera(camera.width, camera.height, fx, fy, *camera.principal_point)
 
 
 _F, _FXY, _C = ("f",), ("fx", "fy"), ("cx", "cy")
@@ -89,7 +106,15 @@ LENSES: tuple[Lens, ...] = (
     ),
     Lens("fisheye", "OPENCV_FISHEYE", (_FXY, (*_C, "k1", "k2"), ("k3", "k4")), start="wide"),
     Lens("eucm", "EUCM", (_FXY, (*_C, "alpha", "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
-    Lens("double_sphere", "DOUBLE_SPHERE", (_FXY, (*_C, "xi", "alpha")), start="wide", shape=(("alpha", 0.5),)),
+    Lens(
+        "double_sphere",
+        "DOUBLE_SPHERE",
+        (_FXY, (*_C, "xi", "alpha")),
+        start="wide",
+        shape=(("xi", -0.2), ("alpha", 0.5)),
+        other_shape=(("xi", 0.3), ("alpha", 0.65)),
+        spare=(("xi", 0.0),),
+    ),
     Lens("division", "EUCM", (_FXY, (*_C, "beta")), start="wide", shape=(("alpha", 0.5), ("beta", 1.0))),
 )
 
