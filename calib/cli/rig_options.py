@@ -37,8 +37,8 @@ class CommonOptions:
     fisheye, eucm …; or of some of them, as in left=opencv5,top=fisheye."""
 
     camera: Annotated[Many, tyro.conf.arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)")] = ()
-    """A camera that is calibrated already, such as left=left.toml, or left=rig.toml of a rig with a camera of that name.
-    It is held."""
+    """A camera that is calibrated already, such as left=left.toml, or left=rig.toml of a rig with a left one. It is
+    held."""
 
     refine_known: Flag = False
     """Refines cameras given by --camera as well."""
