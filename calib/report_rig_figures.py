@@ -133,10 +133,10 @@ def _half_angle(camera: Camera, side: Side) -> float:
 
 
 def _around(points: FloatArray, side: Side) -> Frame:
-    """A frame with a margin, at least a third as high as wide."""
+    """A frame with a margin, neither flat nor much higher than wide."""
     low, high = points.min(0), points.max(0)
     width, height = high - low
-    width = max(width, 0.6 * height)
+    width = max(width, 0.8 * height)
     height = max(height, 0.4 * width)
     (x, y), margin = (low + high) / 2, _MARGIN * max(width, height)
     half = np.array([width / 2, height / 2]) + margin

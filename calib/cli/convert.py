@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "calib convert camera.toml -o camera_info.yaml --to ros",
     "calib convert rig.toml -o camchain.yaml --to kalibr",
+    "calib convert rig.toml -o colmap/cameras.txt",
     "calib convert left_intrinsics.yml -o camera.toml",
     "calib convert camera.toml -o cameras.txt --fit OPENCV",
 )
@@ -60,7 +61,7 @@ class ConvertOptions:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(ConvertOptions, "convert", words, EXAMPLES)
-    from sfm.io.camera_exchange import format_of, read_camera_set, write_camera_set
+    from sfm.io.camera_exchange import format_of, read_camera_set, write_camera_set, write_poses_beside
 
     name = format_of(options.output, options.to)
     if options.output.exists() and options.source.exists() and options.output.samefile(options.source):
@@ -74,7 +75,10 @@ def main(words: Sequence[str]) -> int:
     found = write_camera_set(options.output, cameras, name)
     print(f"{options.output} ({name}), read again:")
     print("\n".join(_lines(found)))
-    for remark in _lost(cameras, name):
+    beside = write_poses_beside(options.output, cameras, name)
+    if beside:
+        print(f"poses: {', '.join(map(str, beside))}")
+    for remark in _lost(cameras, name, beside):
         print(remark)
     return ExitCode.OK
 
@@ -139,11 +143,12 @@ def _lines(found: Sequence[Reread]) -> Iterator[str]:
         yield f"  {one.name}: largest difference {one.apart.largest_px:.1e} px over the image{pose}"
 
 
-def _lost(cameras: CameraSet, name: str) -> Iterator[str]:
+def _lost(cameras: CameraSet, name: str, beside: Sequence[Path]) -> Iterator[str]:
     """What the format has no place for."""
-    if cameras.cams_from_rig is not None and len(cameras) > 1 and name == "colmap":
-        yield "note: a cameras file has no poses; those of the rig are not in it"
-    if cameras.cams_from_rig is not None and len(cameras) > 1 and name == "kalibr" and cameras.unit not in _METRES:
+    posed = cameras.cams_from_rig is not None and len(cameras) > 1
+    if posed and name == "colmap" and not beside:
+        yield "note: the poses of the rig are not in it; call it cameras.txt or cameras.bin to have them in a rigs file"
+    if posed and name == "kalibr" and cameras.unit not in _METRES:
         yield f"note: Kalibr means metres; these translations are in {cameras.unit or 'a unit that the file hides'}"
     if name == "nerfstudio":
         yield "note: there are no frames in it; copy the numbers to the top of a transforms.json that has them"

@@ -37,7 +37,8 @@ class CommonOptions:
     fisheye, eucm …; or of some of them, as in left=opencv5,top=fisheye."""
 
     camera: Annotated[Many, tyro.conf.arg(metavar="NAME=FILE", help_behavior_hint="(repeatable)")] = ()
-    """A camera that is calibrated already, such as left=left.toml. It is held."""
+    """A camera that is calibrated already, such as left=left.toml, or left=rig.toml of a rig with a left one. It is
+    held."""
 
     refine_known: Flag = False
     """Refines cameras given by --camera as well."""
@@ -153,15 +154,18 @@ def known_cameras(options: CommonOptions, names: tuple[str, ...]) -> dict[str, C
     Raises:
         ConfigError: an unknown name, or a file with several cameras; InputError: a file does not do.
     """
-    from sfm.io.camera_files import read_intrinsics
+    from sfm.io.camera_files import camera_names, read_intrinsics
 
     known = {}
     for word in options.camera:
         name, equals, file = word.partition("=")
         if not equals or name not in names:
             raise ConfigError(f"--camera {word}: expected NAME=FILE with a NAME of {', '.join(names)}")
-        cameras = read_intrinsics(Path(file))
-        if len(cameras) != 1:
-            raise ConfigError(f"holds {len(cameras)} cameras, one is needed", path=file)
+        cameras, called = read_intrinsics(Path(file)), camera_names(Path(file))
+        if len(cameras) > 1:
+            cameras = {k: camera for k, camera in cameras.items() if called.get(k) == name}
+        if not cameras:
+            told = f"has no camera {name!r} among {', '.join(called.values())}" if called else "holds several cameras"
+            raise ConfigError(told, path=file, remedy="name a file with one camera, or a rig with one of this name")
         known[name] = next(iter(cameras.values()))
     return known

@@ -156,9 +156,9 @@ def _pairs(found: RigCalibration, plain: RigCovariance | Rejected, by_frame: Rig
     head = ["", "baseline", "σ of corners", "σ of frames", "turn", "σ of corners", "σ of frames", "frames shared",
             "off the line (RMS)", "worst", "off the row (RMS)"]  # fmt: skip
     note = (
-        '<p class="quiet">Off the line: how far corners lie from the epipolar lines of their partners. Off the row: '
-        "the difference of rows after rectification; nothing where cameras look too far apart. The first σ takes all "
-        "corners for independent, the second only frames.</p>"
+        '<p class="quiet">Off the line: how far corners lie from the epipolar lines of their partners, in both images. '
+        "Off the row: the difference of rows after rectification; nothing where cameras look too far apart. The first "
+        "σ takes all corners for independent, the second only frames.</p>"
     )
     return table(head, rows) + note
 

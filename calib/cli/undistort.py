@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,7 +29,8 @@ EXAMPLES = (
 class UndistortOptions:
     """Writes photos without their lens distortion, and the pinhole camera that they now have, camera.toml, beside them.
 
-    The photos themselves are never touched. They must have the size that the camera was calibrated at.
+    The photos themselves are never touched. They must have the size that the camera was calibrated at. Grey photos stay
+    grey, and 16 bits stay 16 bits.
     """
 
     camera: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="CAMERA", help_behavior_hint="")]
@@ -62,7 +62,7 @@ class UndistortOptions:
     """Writes masks/NAME.png too, black where the photo has nothing to show."""
 
     keep_exif: Flag = False
-    """Copies what the photo says of itself: time, place, exposure."""
+    """Copies what the photo says of itself: time, place, exposure. The profile of its colours is kept anyway."""
 
     threads: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint="(default: 0)")] = 0
     """At most so many photos at once; 0 for all cores."""
@@ -82,6 +82,7 @@ def main(words: Sequence[str]) -> int:
     from sfm.core.execution import available_threads, ordered_map
     from sfm.io.atomic import write_bytes
     from sfm.io.camera_files import write_camera_toml
+    from sfm.io.image_encoding import encoded_image
 
     camera, photos = _camera(options.camera), find_photos(options.images)
     if any(path.resolve() == (options.output / name).resolve() for name, path in photos.items()):
@@ -101,7 +102,7 @@ def main(words: Sequence[str]) -> int:
         write_bytes(options.output / name, data)
         if options.masks:
             mask = np.where(valid, np.uint8(255), np.uint8(0))
-            write_bytes(options.output / "masks" / f"{name}.png", _encoded(mask, ".png", b""))
+            write_bytes(options.output / "masks" / f"{name}.png", encoded_image(mask, Path(f"{name}.png")))
         return ""
 
     refused = [
@@ -172,13 +173,11 @@ def _widest_angle(camera: Camera) -> float:
 
 
 def _straightened(path: Path, camera: Camera, map_x: np.ndarray, map_y: np.ndarray, keep_exif: bool) -> bytes:
-    import numpy as np
-    from PIL import Image
-
     from sfm.core.imaging.resample import remap
-    from sfm.io.images import read_image
+    from sfm.io.image_encoding import encoded_image, photo_facts
+    from sfm.io.images import read_pixels
 
-    image = read_image(path)
+    image = read_pixels(path)
     height, width = image.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise ImageError(
@@ -186,21 +185,5 @@ def _straightened(path: Path, camera: Camera, map_x: np.ndarray, map_y: np.ndarr
             path=path,
             remedy="undistort photos at the size at which they were calibrated",
         )
-    if np.array_equal(image[:, :, 0], image[:, :, 1]) and np.array_equal(image[:, :, 0], image[:, :, 2]):
-        image = np.ascontiguousarray(image[:, :, 0])
-    exif = b""
-    if keep_exif:
-        with Image.open(path) as photo:
-            exif = photo.getexif().tobytes()
-    return _encoded(remap(image, map_x, map_y), path.suffix.lower(), exif)
-
-
-def _encoded(image: np.ndarray, suffix: str, exif: bytes) -> bytes:
-    from PIL import Image
-
-    kinds = {".jpg": "JPEG", ".jpeg": "JPEG", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".webp": "WEBP"}
-    kind = kinds.get(suffix, "PNG" if suffix == ".png" else "BMP" if suffix == ".bmp" else "PPM")
-    how = {"JPEG": {"quality": 95, "subsampling": 0}, "WEBP": {"lossless": True}}.get(kind, {})
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, kind, **how, **({"exif": exif} if exif else {}))
-    return buffer.getvalue()
+    straight = remap(image, map_x, map_y)
+    return encoded_image(straight, path, photo_facts(path, *straight.shape[1::-1], with_exif=keep_exif))

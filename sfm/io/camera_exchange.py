@@ -25,6 +25,7 @@ from sfm.io.camera_opencv import opencv_text
 from sfm.io.camera_ros import ros_text
 from sfm.io.camera_set import CameraSet
 from sfm.io.camera_tables import toml_document
+from sfm.io.colmap_rigs import has_place_for_poses, read_rig_beside, write_rig_beside
 from sfm.io.rig_files import RigFile, read_rig_file, write_rig_file
 
 _BY_SUFFIX = {".toml": "parallax", ".txt": "colmap", ".bin": "colmap", ".json": "nerfstudio"}
@@ -77,7 +78,7 @@ def read_camera_set(path: Path | str, size: tuple[int, int] | None = None) -> tu
         return "parallax", _read_toml(path)
     cameras = read_intrinsics(path)
     names = tuple(f"camera{k}" for k in cameras) if len(cameras) > 1 else ("camera",)
-    return "colmap", CameraSet(names, tuple(cameras.values()))
+    return "colmap", CameraSet(names, tuple(cameras.values()), read_rig_beside(path, cameras))
 
 
 def format_of(path: Path | str, named: str = "") -> str:
@@ -121,6 +122,19 @@ def write_camera_set(path: Path | str, cameras: CameraSet, name: str) -> tuple[R
     except (FormatError, ConfigError) as error:
         raise FormatError(error.cause, path=path, remedy=error.remedy) from error
     return found
+
+
+def write_poses_beside(path: Path | str, cameras: CameraSet, name: str) -> tuple[Path, ...]:
+    """Writes what the format keeps of poses in files of their own, beside the cameras; returns their paths.
+
+    Raises:
+        InputError: the system refuses.
+        FormatError: what is read again is not what was written.
+    """
+    path = Path(path)
+    if name != "colmap" or cameras.cams_from_rig is None or len(cameras) < 2 or not has_place_for_poses(path):
+        return ()
+    return write_rig_beside(path, cameras)
 
 
 def _write(path: Path, cameras: CameraSet, name: str) -> None:

@@ -1,4 +1,6 @@
-"""Calibrations on disk: COLMAP's cameras.txt or .bin, files of other programs, and the camera file of Parallax.
+"""Calibrations on disk: COLMAP's cameras.txt or .bin, files of other programs, and the files of Parallax.
+
+Rig files are told in `rig_files`; a camera file is
 
 [camera]
 name = "left"                     # optional
@@ -22,9 +24,10 @@ from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, FormatError
 from sfm.io import colmap_binary, colmap_text
 from sfm.io.atomic import write_text
-from sfm.io.camera_foreign import read_foreign_cameras
+from sfm.io.camera_foreign import FOREIGN_SUFFIXES, read_foreign_cameras
 from sfm.io.camera_records import TABLES, CameraRecord, record_from_document, record_lines
 from sfm.io.camera_tables import camera_from_table, check_keys, toml_document
+from sfm.io.rig_files import is_rig_file, read_rig_file
 
 
 def read_intrinsics(path: Path | str) -> dict[int, Camera]:
@@ -39,6 +42,8 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
     """
     path = Path(path)
     match path.suffix.lower():
+        case ".toml" if is_rig_file(path):
+            cameras = dict(enumerate(read_rig_file(path).rig.cameras, 1))
         case ".toml":
             cameras = {1: read_camera_file(path)[0]}
         case ".bin":
@@ -56,6 +61,21 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
         camera_id: Camera(camera.model, camera.width, camera.height, camera.params, has_prior_focal_length=True)
         for camera_id, camera in cameras.items()
     }
+
+
+def camera_names(path: Path | str) -> dict[int, str]:
+    """What the file of a rig calls the cameras that `read_intrinsics` gives, by the same ids; nothing for other files.
+
+    Raises:
+        SfmError: as `read_intrinsics`.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".toml" and is_rig_file(path):
+        return dict(enumerate(read_rig_file(path).rig.names, 1))
+    if path.suffix.lower() in FOREIGN_SUFFIXES:
+        cameras = read_foreign_cameras(path)
+        return dict(enumerate(cameras.names, 1)) if cameras.cams_from_rig is not None else {}
+    return {}
 
 
 def write_camera_toml(
@@ -89,6 +109,9 @@ def read_camera_file(path: Path | str) -> tuple[Camera, CameraRecord]:
     """
     path = Path(path)
     document = toml_document(path)
+    if "rig" in document:
+        remedy = f"take one out: calib convert {path} -o camera.toml --camera NAME"
+        raise ConfigError("is the file of a rig, one camera is needed", path=path, remedy=remedy)
     check_keys(document, ("camera", *TABLES), path)
     table = document.get("camera")
     if not isinstance(table, dict):

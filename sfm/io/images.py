@@ -102,10 +102,25 @@ def read_image(path: Path | str, *, gray: bool = False) -> ImageU8:
         ImageError: the file is missing, empty, truncated, no image, or below `MIN_SIDE_PX`.
     """
     path = Path(path)
-    image = _to_8_bits(_decode(read_image_bytes(path), path, gray), path)
+    colour = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
+    image = _to_8_bits(_decode(read_image_bytes(path), path, colour), path)
     height, width = image.shape[:2]
     check_size(width, height, path)
     return image if gray else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_pixels(path: Path | str) -> np.ndarray:
+    """As `read_image`, but grey or RGB, and of 8 or 16 bits, as the file is.
+
+    Raises:
+        ImageError: as there.
+    """
+    path = Path(path)
+    image = _decode(read_image_bytes(path), path, cv2.IMREAD_ANYCOLOR)
+    image = image if image.dtype == np.uint16 else _to_8_bits(image, path)
+    height, width = image.shape[:2]
+    check_size(width, height, path)
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def check_size(width: int, height: int, path: Path) -> None:
@@ -251,9 +266,8 @@ def _silence_decoder() -> None:
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-def _decode(data: bytes, path: Path, gray: bool) -> np.ndarray:
+def _decode(data: bytes, path: Path, colour: int) -> np.ndarray:
     _silence_decoder()
-    colour = cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR
     try:
         image = cv2.imdecode(
             np.frombuffer(data, np.uint8), colour | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

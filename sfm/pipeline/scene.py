@@ -18,7 +18,7 @@ from sfm.core.cameras.priors import infer_camera
 from sfm.core.errors import ImageError, InputError
 from sfm.core.events import ImageRead, Note, Observer, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
-from sfm.io.camera_files import read_intrinsics
+from sfm.io.camera_files import camera_names, read_intrinsics
 from sfm.io.database import Database, Decision, ImageSource
 from sfm.io.exif import ImageInfo, prior_focal_px, read_image_info
 from sfm.io.images import check_size, list_images, read_image_bytes
@@ -172,7 +172,8 @@ def _given_groups(photos: Sequence[_Photo], config: CameraConfig) -> list[tuple[
     cameras = read_intrinsics(config.intrinsics)
     sizes = [(photo.name, photo.info.width, photo.info.height) for photo in photos]
     groups: dict[Hashable, tuple[Camera, list[str]]] = {}
-    for name, (camera_id, camera) in assigned_cameras(cameras, sizes, config.intrinsics).items():
+    assigned = assigned_cameras(cameras, sizes, config.intrinsics, camera_names(config.intrinsics))
+    for name, (camera_id, camera) in assigned.items():
         groups.setdefault((camera_id, camera.width, camera.height), (camera, []))[1].append(name)
     return list(groups.values())
 

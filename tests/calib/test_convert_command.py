@@ -10,7 +10,10 @@ import pytest
 from calib.cli import main
 from sfm.core.cameras import Camera
 from sfm.core.errors import ExitCode
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.scene import CameraRig
 from sfm.io.camera_files import read_intrinsics, write_camera_toml
+from sfm.io.rig_files import RigFile, read_rig_file, write_rig_file
 
 BENT = Camera("FULL_OPENCV", 640, 480, np.array([536.0, 536, 342.8, 236, -0.27, 0.04, 1e-3, 0, -0.03, 0, 0, 0]))
 
@@ -58,3 +61,18 @@ def test_what_cannot_be_done_is_said_in_a_line(camera: Path, capsys, monkeypatch
     assert told in error
     assert error.count("\n") == 1
     assert camera.read_bytes() == before
+
+
+def test_the_poses_of_a_rig_go_beside_the_cameras_or_are_said_to_be_left_out(tmp_path: Path, capsys) -> None:
+    beside = Rigid3.stack([Rigid3.identity(), Rigid3.exp(np.array([0.01, -0.3, 0.02, -0.12, 0.001, 0.002]))])
+    write_rig_file(tmp_path / "rig.toml", RigFile(CameraRig(("left", "right"), (BENT, BENT), beside, "left")))
+    assert main(["convert", str(tmp_path / "rig.toml"), "-o", str(tmp_path / "cameras.txt")]) == ExitCode.OK
+    told = capsys.readouterr().out
+    assert "rigs.txt" in told
+    assert "note" not in told
+    assert main(["convert", str(tmp_path / "cameras.txt"), "-o", str(tmp_path / "again.toml")]) == ExitCode.OK
+    again = read_rig_file(tmp_path / "again.toml").rig
+    np.testing.assert_allclose(again.cams_from_rig.matrix, beside.matrix, atol=1e-14)
+    capsys.readouterr()
+    assert main(["convert", str(tmp_path / "rig.toml"), "-o", str(tmp_path / "two.txt")]) == ExitCode.OK
+    assert "the poses of the rig are not in it" in capsys.readouterr().out

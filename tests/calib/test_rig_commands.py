@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import cv2
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.boards import chessboard
-from calib.cli.rig_options import named_sources
+from calib.cli.rig_options import CommonOptions, known_cameras, named_sources
 from calib.cli.robot_poses import read_robot_poses
 from datasets.synthetic.boards import DISTORTED, PINHOLE, pose, render
 from sfm.core.errors import ConfigError, FormatError
@@ -82,6 +83,10 @@ def test_a_rig_with_a_known_camera_is_told_in_a_table(sfm, tmp_path, photos):
     file = read_rig_file(tmp_path / "rig.toml")
     np.testing.assert_array_equal(file.rig.cameras[0].params, DISTORTED.params)
     assert file.sigmas[0].params.max() == 0
+    options = CommonOptions(board=SPEC, output=tmp_path / "x.toml", camera=(f"b={tmp_path / 'rig.toml'}",))
+    np.testing.assert_array_equal(known_cameras(options, ("a", "b"))["b"].params, file.rig.cameras[1].params)
+    with pytest.raises(ConfigError, match="no camera 'c' among a, b"):
+        known_cameras(dataclasses.replace(options, camera=(f"c={tmp_path / 'rig.toml'}",)), ("c",))
 
 
 def test_a_camera_is_found_on_its_robot(sfm, tmp_path, photos):

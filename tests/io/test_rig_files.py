@@ -10,6 +10,7 @@ from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import CameraRig
+from sfm.io.camera_files import camera_names, read_camera_file, read_intrinsics, write_camera_toml
 from sfm.io.rig_files import MountedSigmas, RigFile, read_rig_file, write_rig_file
 
 LEFT = Camera("OPENCV", 640, 480, np.array([534.1, 533.9, 342.2, 235.7, -0.27, -0.04, 0.001, -0.0003]))
@@ -89,3 +90,20 @@ def test_a_rig_of_nobody_is_a_mistake() -> None:
         CameraRig(("a", "b"), (LEFT, RIGHT), POSES, "b")
     with pytest.raises(ValueError, match="poses are"):
         CameraRig(("a",), (LEFT, RIGHT), POSES, "a")
+
+
+def test_a_rig_serves_as_intrinsics_with_the_names_of_its_cameras(tmp_path: Path) -> None:
+    path = written(tmp_path, RigFile(RIG))
+    cameras = read_intrinsics(path)
+    assert camera_names(path) == dict(enumerate(RIG.names, 1))
+    for k, camera in enumerate(RIG.cameras, 1):
+        np.testing.assert_array_equal(cameras[k].params, camera.params)
+        assert cameras[k].has_prior_focal_length
+    write_camera_toml(tmp_path / "one.toml", LEFT, name="left")
+    assert camera_names(tmp_path / "one.toml") == {}
+
+
+def test_where_one_camera_is_needed_a_rig_says_how_to_take_one_out(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="is the file of a rig") as caught:
+        read_camera_file(written(tmp_path, RigFile(RIG)))
+    assert "--camera NAME" in str(caught.value)

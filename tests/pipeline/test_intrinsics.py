@@ -76,3 +76,36 @@ def test_cameras_that_fit_alike_are_refused():
 def test_images_of_another_shape_are_refused():
     with pytest.raises(ConfigError, match=r"for 640×480 px, but b has 640×427 px"):
         assigned_cameras({1: camera()}, [("a", 640, 480), ("b", 640, 427)], "file")
+
+
+RIG = {1: camera(f=100.0), 2: camera(f=200.0), 3: camera(800, 600, 300.0)}
+NAMES = {1: "cam1", 2: "cam10", 3: "Top"}
+
+
+@pytest.mark.parametrize(
+    ("image", "taken"),
+    [
+        ("cam1/07.png", 1), ("day/CAM10/07.png", 2), ("cam10/cam1_07.png", 2), ("cam1_07.png", 1), ("cam10-7.png", 2),
+        ("top7.png", 3),
+    ],
+)  # fmt: skip
+def test_cameras_with_names_serve_the_photos_that_are_called_so(image, taken):
+    size = (RIG[taken].width, RIG[taken].height)
+    other = ("cam1/other.png", 640, 480)
+    assert assigned_cameras(RIG, [(image, *size), other], "rig.toml", NAMES)[image] == (taken, RIG[taken])
+
+
+def test_photos_that_no_name_fits_go_by_size_and_are_refused_where_that_leaves_a_choice():
+    rig = {1: camera(), 2: camera(800, 600)}
+    names = {1: "left", 2: "right"}
+    images = [("left/a.png", 640, 480), ("b.png", 800, 600)]
+    assert [entry[0] for entry in assigned_cameras(rig, images, "rig.toml", names).values()] == [1, 2]
+    for unnamed in ("b.png", "lefty.png", "left/right/b.png"):
+        with pytest.raises(ConfigError, match="2 of its 3 cameras fit") as caught:
+            assigned_cameras({**rig, 3: camera(f=7.0)}, [images[0], (unnamed, 640, 480)], "rig.toml", names)
+        assert "a folder of its name: left, right" in str(caught.value)
+
+
+def test_a_photo_of_another_shape_than_its_camera_is_refused():
+    with pytest.raises(ConfigError, match=r"for 640×480 px, but cam1/a has 800×500 px"):
+        assigned_cameras(RIG, [("cam1/a", 800, 500)], "rig.toml", NAMES)
