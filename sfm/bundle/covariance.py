@@ -95,9 +95,7 @@ def covariance(
     layout, (cost, _) = system.layout, system.linearize()
     held = held_by_three_points(problem, layout) if config.gauge == "three_points" else None
     known = system.information(held)
-    motions = _motions(problem, layout)
-    if config.gauge != "free":
-        motions = motions[:, :0]
+    motions = _motions(problem, layout) if config.gauge == "free" else np.zeros((6 * layout.rows, 0))
     sigma = system.inverse(motions)
     if isinstance(sigma, int):
         return _undetermined(sigma, problem, layout)
@@ -163,7 +161,8 @@ def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
         unmoved[:, :, 6] = lengths[~problem.rigs.free_sensors]
         forbidden.append(unmoved.reshape(-1, 7))
     forbidden += [motions_seen(problem, layout, tangents, shared)]
-    _, sizes, directions = np.linalg.svd(np.concatenate(forbidden))
+    # Seven columns, and a row for each coordinate of a constant point: the triangle of a QR decomposition will do.
+    _, sizes, directions = np.linalg.svd(np.linalg.qr(np.concatenate(forbidden), mode="r"))
     allowed = directions[sizes <= 1e-9 * max(float(sizes.max()), 1e-300)].T
     free = np.concatenate([tangents[layout.slot_frame], shared])
     return free.reshape(-1, 7)[: 6 * (poses + len(shared))] @ allowed

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -127,6 +128,23 @@ def test_constant_parts_take_the_freedom_of_the_scene_away(make_problem, rng):
         assert not free.poses[:constant].any()
         same = np.allclose(free.poses, held.poses, rtol=1e-6, atol=1e-12)
         assert same == (constant == 2)
+
+
+def test_twenty_thousand_constant_points_take_no_memory_to_speak_of(make_problem, rng):
+    """A square of the number of their coordinates would be 29 GB."""
+    count = 20_000
+    problem = make_problem(rng, images=3, points=count, seen=0.5)
+    problem = dataclasses.replace(problem, free_points=np.zeros(count, bool))
+    tracemalloc.start()
+    free = covariance(problem, FREE)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    held = covariance(problem)
+    assert isinstance(free, BundleCovariance)
+    assert isinstance(held, BundleCovariance)
+    np.testing.assert_array_equal(free.poses, held.poses)
+    assert free.poses.any(axis=(1, 2)).all()
+    assert peak < 5000 * count
 
 
 def test_predicted_covariances_are_those_of_repeated_measurements(make_problem, rng):
