@@ -13,10 +13,10 @@ import pytest
 from calib.boards import Board, charuco, chessboard
 from calib.cli.photos import detection_json
 from calib.detect import Detection
+from datasets.synthetic.boards import DISTORTED, pose, render
 from sfm.core.cameras import Camera
 from sfm.io.camera_files import read_camera_file
 from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen
-from tests.calib.boards_in_view import DISTORTED, pose, render
 
 BOARD = chessboard(9, 6, 0.03)
 NAMED = "chessboard:9x6:30mm"
