@@ -39,8 +39,8 @@ _FEW_VIEWS = 8
 _TILT = math.radians(20.0)
 _UNCOVERED = 0.15
 """Share of the image's border, in cells, beyond what any corner covers that is told."""
-_VIEW_FACTOR = 2.0
-"""Times the median error of views that one is named at."""
+_VIEW_FACTOR, _VIEW_PX = 2.0, 0.1
+"""Times the median error of views, and px, that one is named at."""
 _UNCERTAIN_PX = 1.0
 
 
@@ -133,7 +133,7 @@ def _views(found: Calibration) -> Iterator[Finding]:
     if count < _FEW_VIEWS:
         yield Finding("few_views", f"{count} views", "take 15 to 30")
     rms = found.view_rms_px
-    for v in np.flatnonzero(rms > _VIEW_FACTOR * np.median(rms)):
+    for v in np.flatnonzero(rms > max(_VIEW_FACTOR * float(np.median(rms)), _VIEW_PX)):
         yield Finding(
             "outlier_view",
             f"{found.observations.names[v]}: {rms[v]:.2f} px where the median view has {np.median(rms):.2f} px",
@@ -182,10 +182,11 @@ def _shape_of_residuals(found: Calibration) -> Iterator[Finding]:
     white = whiteness(found)
     board, image = (share > _SHARE and share > _CLEAR * sigma for share, sigma in (white.board, white.image))
     if board:
+        richer = "paraboloid or free" if found.shape.kind in ("flat", "scale") else "free"
         yield Finding(
             "bent_board",
             f"{100 * white.board[0]:.0f} % of the variance of residuals is corners that lie elsewhere than designed",
-            "let the board's shape be estimated (paraboloid or free), or glue it to glass",
+            f"let the board's shape be estimated ({richer}), or glue it to glass",
         )
     if image:
         yield Finding(

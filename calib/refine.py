@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from calib.refine_board import BoardShape, board_shape
 from calib.refine_checks import check_determined
-from calib.refine_fit import CalibrationConfig, Fit, solve_by_stages, turned_back
+from calib.refine_fit import CalibrationConfig, Fit, solve_from_start, turned_back
 from calib.refine_lenses import lens_by_name
 from calib.refine_reject import RejectedView, reject_outliers, sort_out
 from calib.refine_system import CalibrationSystem, Estimate
@@ -48,6 +48,7 @@ class Calibration(Value):
         fallbacks: what was not estimated as asked, or rests on little, in words.
         converged: another step, undamped, promises less than a billionth of the cost. It is False where the solution is
             held back by `keep_invertible`: the lens model has more coefficients than the photos can bear.
+        keep_invertible: as it was calibrated; see `CalibrationConfig`.
     """
 
     lens: str
@@ -66,6 +67,7 @@ class Calibration(Value):
     converged: bool
     iterations: int
     cost: float
+    keep_invertible: bool = True
 
     @property
     def estimate(self) -> Estimate:
@@ -86,8 +88,10 @@ class Calibration(Value):
 
     def system(self) -> CalibrationSystem:
         """The problem at its solution."""
-        free_shape = len(self.shape.coefficients) > 0
-        return CalibrationSystem(self.observations, self.estimate, self.columns, free_shape=free_shape)
+        return CalibrationSystem(
+            self.observations, self.estimate, self.columns, free_shape=len(self.shape.coefficients) > 0,
+            keep_invertible=self.keep_invertible,
+        )  # fmt: skip
 
 
 def calibrate(
@@ -116,7 +120,7 @@ def calibrate(
     shown = np.bincount(observations.rows, minlength=len(board))
     shape = board_shape(config.shape, observations.board, shown >= 2)
     fit = Fit(lens, config, start, shape)
-    solved = solve_by_stages(fit, observations, homographies.errors)
+    solved = solve_from_start(fit, observations, homographies)
     if isinstance(solved, Rejected):
         return solved
     system, summary = solved
@@ -171,4 +175,5 @@ def _result(
         converged=system.is_at_minimum(summary.final_cost),
         iterations=len(summary.iterations) - 1,
         cost=summary.final_cost,
+        keep_invertible=fit.config.keep_invertible,
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from calib.refine_fit import Fit
-from calib.refine_system import CalibrationSystem
+from calib.refine_system import RIDGE, CalibrationSystem
 from calib.zhang import largest_angle_between
 from sfm.core.arrays import FloatArray
 from sfm.core.errors import Rejected
@@ -28,15 +28,20 @@ def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> C
     """Holds the principal point where the views leave it open; refuses where they leave the focal length open."""
     names = system.estimate.camera.model_info.param_names
     columns, longer = fit.lens.columns(), max(system.observations.width, system.observations.height)
+    fallbacks: tuple[str, ...] = ()
+    if fit.lens.spare and _is_focal_open(_deviations(system, summary, [names[k] for k in columns]), system):
+        held = _without_spare(fit, system)
+        if isinstance(held, Rejected):
+            return held
+        system, summary, columns, fallbacks = held
     deviations = _deviations(system, summary, [names[k] for k in columns])
     focal = [d for name, d in deviations.items() if name.startswith("f")]
     center = [d for name, d in deviations.items() if name.startswith("c")]
-    fallbacks: tuple[str, ...] = ()
     between, _, one_axis = _tilts(system.estimate.rotations)
     mean = system.estimate.camera.mean_focal_length
     if max(center) > _OPEN_CENTER * longer or max(focal) > _OPEN_FOCAL * mean:
         columns = np.array([k for k in columns if not names[k].startswith("c")])
-        fallbacks = (f"the principal point is held at the centre of the image: {_tilts_in_words(system)}",)
+        fallbacks += (f"the principal point is held at the centre of the image: {_tilts_in_words(system)}",)
         camera = fit.start.camera
         centred = fit.lens.camera(
             camera.width, camera.height, *camera.focal_lengths, camera.width / 2, camera.height / 2
@@ -49,7 +54,7 @@ def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> C
         focal = [d for name, d in deviations.items() if name.startswith("f")]
         mean = system.estimate.camera.mean_focal_length
     elif between < _PARALLEL or one_axis:
-        fallbacks = (f"focal length and principal point rest on little: {_tilts_in_words(system)}",)
+        fallbacks += (f"focal length and principal point rest on little: {_tilts_in_words(system)}",)
     if _tilts(system.estimate.rotations)[1] < _FRONTAL:
         # The focal length and all distances may grow together, whatever the noise makes of it.
         return Rejected("undetermined_focal", _tilts_in_words(system))
@@ -60,9 +65,32 @@ def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> C
     return system, summary, columns, fallbacks
 
 
+def _is_focal_open(deviations: Mapping[str, float], system: CalibrationSystem) -> bool:
+    worst = max(d for name, d in deviations.items() if name.startswith("f"))
+    return not worst <= _OPEN_FOCAL * system.estimate.camera.mean_focal_length
+
+
+def _without_spare(fit: Fit, system: CalibrationSystem) -> Checked | Rejected:
+    """The solution with the parameters held that the lens can do without."""
+    spare, camera = dict(fit.lens.spare), system.estimate.camera
+    names, params = camera.model_info.param_names, np.array(camera.params)
+    for name, value in spare.items():
+        params[names.index(name)] = value
+    estimate = fit.placed(system.observations, camera.with_params(params), False)
+    if isinstance(estimate, Rejected):
+        return estimate
+    columns = np.array([k for k in fit.lens.columns() if names[k] not in spare])
+    told = ", ".join(f"{name} is held at {value:g}" for name, value in spare.items())
+    words = f"{told}: the photos do not tell it from the focal length"
+    return (*fit.solve(system.observations, estimate, columns), columns, (words,))
+
+
 def _deviations(system: CalibrationSystem, summary: Summary, names: Sequence[str]) -> dict[str, float]:
     """Standard deviation of each free parameter, inf where nothing determines them."""
     inverse = system.shared_inverse()
+    if inverse is None:
+        # Coefficients of the lens may be open and the focal length not; with the ridge what is open is very uncertain.
+        inverse = system.shared_inverse(RIDGE)
     freedom = max(2 * len(system.observations.rows) - 6 * len(system.observations) - system.shared_count, 1)
     noise = 2 * summary.final_cost / freedom
     if inverse is None:

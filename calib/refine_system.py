@@ -34,6 +34,11 @@ _FLOOR = 1e-12
 """Least diagonal of the damping, over the largest of its kind."""
 _CONVERGED, _EXACT = 1e-9, 1e-20
 """Part of the cost, and px² a corner, that need not be gained."""
+RIDGE = 1e-12
+"""Damping that makes a matrix definite in which coefficients of a lens are not determined, and changes nothing else."""
+_LOCAL = 1e-4
+"""Part of the cost that a step takes off, below which it teaches something of the second derivative."""
+_NO_STEP = (math.nan, math.nan, math.nan)
 _NO_RESIDUALS = np.zeros((0, 2))
 
 
@@ -66,6 +71,7 @@ class _Point:
     translations: FloatArray
     costs: FloatArray
     blocks: FloatArray
+    cost: float = math.nan
 
 
 class CalibrationSystem:
@@ -77,11 +83,14 @@ class CalibrationSystem:
         keep_invertible: lets no observation lie where the distortion cannot be inverted.
         caution: factor of the damping. A rational distortion is nearly undetermined in some directions, in which even
             the loop's first damping, small as it is, holds back for tens of steps; near the minimum none is needed.
+        by_secant: near the minimum, what the normal matrix lacks of the second derivative is learnt from the steps. In
+            directions that are nearly undetermined it lacks half or more, and steps overshoot for tens of times.
     """
 
     def __init__(
         self, observations: Observations, estimate: Estimate, columns: np.ndarray, *, free_shape: bool = False,
         loss: Loss = "trivial", loss_scale: float = 1.0, keep_invertible: bool = True, caution: float = 1.0,
+        by_secant: bool = False,
     ) -> None:  # fmt: skip
         self.observations, self._camera, self._shape = observations, estimate.camera, estimate.shape
         self._columns = np.asarray(columns, np.int64)
@@ -90,6 +99,7 @@ class CalibrationSystem:
         self._loss = loss_id(loss), float(loss_scale)
         self._lost = 0.5 * float(evaluate_loss(loss, np.array(_LOST_PX**2), loss_scale)[0])
         self._keep_invertible, self._caution = keep_invertible, caution
+        self._board = np.array(estimate.shape.points3D)
         views, shared = len(observations), len(self._columns) + self._basis.shape[2]
         self._now = self._place(
             estimate.camera.params, estimate.shape.coefficients, estimate.rotations, estimate.translations
@@ -97,9 +107,13 @@ class CalibrationSystem:
         self._trial = self._place(np.zeros(0), np.zeros(0), np.empty((views, 3, 3)), np.empty((views, 3)))
         self._evaluate(self._now)
         self._L, self._Y = np.zeros((views, 6, 6)), np.empty((views, 6, shared + 1))
-        self._S, self._by_pose, self._by_shared = (
-            np.empty((shared + 1, shared + 1)), np.empty((views, 6)), np.empty(shared),
-        )  # fmt: skip
+        self._S, self._F = np.empty((shared + 1, shared + 1)), np.zeros((shared + 1, shared + 1))
+        self._by_pose, self._by_shared = np.empty((views, 6)), np.empty(shared)
+        # What is lacking of the second derivative, nothing, and the last step with the reduced gradient before it.
+        self._bend, self._straight = np.zeros((shared, shared)), np.zeros((shared, shared))
+        self._last = np.zeros(shared), np.zeros(shared)
+        self._by_secant, self._bends, self._learns = by_secant, False, False
+        self._diagonal, self._shared_diagonal, self._slope = np.empty((views, 6)), np.empty(shared), math.nan
 
     @property
     def shared_count(self) -> int:
@@ -132,71 +146,76 @@ class CalibrationSystem:
 
     def linearize(self) -> tuple[float, float]:
         """Cost and largest entry of the gradient at the current parameters."""
-        blocks = self._now.blocks
-        diagonal = np.diagonal(blocks, axis1=1, axis2=2)
-        gradient = blocks[:, -1, :-1]
-        floor = _FLOOR * diagonal[:, :6].max(initial=0.0)
-        self._diagonal = self._caution * np.maximum(diagonal[:, :6], floor)
-        shared = diagonal[:, 6:-1].sum(0)
-        self._shared_diagonal = self._caution * np.where(shared > 0, shared, 1.0)
-        self._gradient = gradient[:, :6], gradient[:, 6:].sum(0)
-        largest = max(float(np.abs(part).max(initial=0.0)) for part in self._gradient)
-        return float(self._now.costs.sum()), largest
+        largest = kernels.scale_views(
+            self._now.blocks, _FLOOR, self._caution, self._diagonal, self._shared_diagonal
+        )  # fmt: skip
+        return self._now.cost, largest
 
     def try_step(self, damping: float) -> Trial | None:
         """Solves the damped normal equations, moves by the solution and evaluates there."""
-        now, trial = self._now, self._trial
-        if not kernels.solve_views(
-            now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, self._by_pose,
-            self._by_shared,
-        ):  # fmt: skip
-            return None
-        by_pose, by_shared, free = self._by_pose, self._by_shared, len(self._columns)
-        square = float(np.vdot(by_pose, by_pose) + by_shared @ by_shared)
+        now, trial, free = self._now, self._trial, len(self._columns)
+        square, slope, damped = self._solve(damping)
         if not math.isfinite(square):
             return None
-        kernels.move_poses(now.rotations, now.translations, by_pose, trial.rotations, trial.translations)
+        moved = kernels.move_poses(
+            now.rotations, now.translations, self._by_pose, trial.rotations, trial.translations
+        )  # fmt: skip
         trial.params, trial.coefficients = now.params.copy(), now.coefficients.copy()
-        trial.params[self._columns] += by_shared[:free]
+        trial.params[self._columns] += self._by_shared[:free]
         if self._basis.shape[2]:
-            trial.coefficients += by_shared[free:]
+            trial.coefficients += self._by_shared[free:]
         self._evaluate(trial)
-        damped = float(np.vdot(self._diagonal, by_pose**2) + self._shared_diagonal @ by_shared**2)
-        slope = float(np.vdot(self._gradient[0], by_pose) + self._gradient[1] @ by_shared)
-        norm = math.sqrt(float(np.vdot(now.translations, now.translations) + now.params @ now.params))
-        return Trial(float(trial.costs.sum()), 0.5 * (damping * damped - slope), math.sqrt(square), norm)
+        norm = math.sqrt(moved + float(now.params @ now.params))
+        return Trial(trial.cost, 0.5 * (damping * damped - slope), math.sqrt(square), norm)
 
-    def shared_inverse(self) -> FloatArray | None:
-        """S⁻¹ (K, K) at the current parameters, None where they are not determined."""
+    def _solve(self, damping: float) -> tuple[float, float, float]:
+        """Squared length of the step, its slope and its damped square; NaN where there is none."""
+        now = self._now
+        if not kernels.eliminate_views(now.blocks, self._diagonal, damping, self._L, self._Y, self._S):
+            return _NO_STEP
+        if self._learns:
+            self._learns = False
+            kernels.bend_by_secant(self._S, *self._last, self._bend)
+        for bend in (self._bend, self._straight) if self._bends else (self._straight,):
+            found = kernels.step_views(
+                now.blocks, self._diagonal, self._shared_diagonal, damping, self._L, self._Y, self._S, bend, self._F,
+                self._by_pose, self._by_shared,
+            )  # fmt: skip
+            if math.isfinite(found[0]):
+                return found
+        return _NO_STEP
+
+    def shared_inverse(self, ridge: float = 0.0) -> FloatArray | None:
+        """S⁻¹ (K, K) at the current parameters, None where they are not determined; with so much damping, if wanted."""
         self.linearize()
-        if not kernels.solve_views(
-            self._now.blocks, self._diagonal, self._shared_diagonal, 0.0, self._L, self._Y, self._S, self._by_pose,
-            self._by_shared,
-        ):  # fmt: skip
+        self._bends = self._learns = False
+        self._slope = self._solve(ridge / self._caution)[1]
+        if math.isnan(self._slope):
             return None
         count = self.shared_count
-        root = solve_triangular(self._S[:count, :count], np.eye(count), lower=True)
+        root = solve_triangular(self._F[:count, :count], np.eye(count), lower=True)
         return root.T @ root
 
     def newton_decrement(self) -> float:
-        """What one more undamped step promises to take off the cost; inf where there is no such step."""
-        if self.shared_inverse() is None:
+        """What one more step, all but undamped, promises to take off the cost; inf where there is no such step."""
+        if self.shared_inverse() is None and self.shared_inverse(RIDGE) is None:
             return math.inf
-        return -0.5 * float(np.vdot(self._gradient[0], self._by_pose) + self._gradient[1] @ self._by_shared)
+        return -0.5 * self._slope
 
     def is_at_minimum(self, cost: float) -> bool:
         """Whether one more undamped step promises less than a billionth of the cost."""
         return self.newton_decrement() <= _CONVERGED * cost + _EXACT * len(self.observations.rows)
 
-    def is_invertible(self) -> bool:
-        """Whether all corners lie where the distortion can be inverted."""
-        o, now = self.observations, self.estimate
-        points = now.rotations[o.view_of] @ now.shape.points3D[o.rows][:, :, None]
-        return bool(np.all(now.camera.project(points[:, :, 0] + now.translations[o.view_of])[1]))
-
     def accept(self) -> None:
         """Makes the last trial current."""
         self._now, self._trial = self._trial, self._now
+        if not self._by_secant:
+            return
+        self._learns = self._bends = self._trial.cost - self._now.cost <= _LOCAL * self._trial.cost
+        if self._bends:
+            self._last[0][:], self._last[1][:] = self._by_shared, self._S[-1, :-1]
+        else:
+            self._bend[:] = 0.0
 
     def _place(self, params: FloatArray, coefficients: FloatArray, R: FloatArray, t: FloatArray) -> _Point:
         views, width = len(self.observations), 7 + len(self._columns) + self._basis.shape[2]
@@ -206,13 +225,10 @@ class CalibrationSystem:
     def _evaluate(self, point: _Point, residuals: FloatArray = _NO_RESIDUALS) -> None:
         o, model = self.observations, self._camera.model_info.model_id
         limit = distortion_limit(model, point.params) ** 2 if self._keep_invertible else -math.inf
-        board = self._shape.given
+        board = self._board
         if self._basis.shape[2]:
-            board = board + self._shape.basis @ point.coefficients
-        elif len(self._shape.coefficients):
-            board = self._shape.points3D
-        kernels.evaluate_views(
+            board = self._shape.given + self._shape.basis @ point.coefficients
+        point.cost = kernels.evaluate_views(
             model, point.params, self._columns, limit, point.rotations, point.translations, o.offsets, o.rows,
-            np.array(board), self._basis, o.points2D, o.roots, *self._loss, self._lost, point.costs,
-            point.blocks, residuals,
+            board, self._basis, o.points2D, o.roots, *self._loss, self._lost, point.costs, point.blocks, residuals,
         )  # fmt: skip

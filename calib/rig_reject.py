@@ -8,16 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.refine_fit import ROBUST
-from calib.refine_reject import RejectedView
+from calib.refine_reject import RejectedView, limits_of, spread_of, views_that_belong
 from calib.rig_system import RigEstimate, RigSystem
 from calib.rig_views import RigObservations
-from sfm.core.arrays import FloatArray, Value, Vector
+from sfm.core.arrays import FloatArray, Value
 from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import StopRules, Summary, minimize
 from sfm.core.optim.losses import Loss
 
-_RAYLEIGH_MEDIAN = 1.17741
-"""Median length of a pair of unit normal numbers."""
 _NEAR = 1e-6
 """Damping near the minimum over the usual one."""
 _WORSE = 3.0
@@ -74,29 +72,30 @@ def reject_from_rig(
     fit: RigFit, system: RigSystem, summary: Summary, views: Sequence[list[RejectedView]],
     corners: Sequence[list[tuple[str, int]]],
 ) -> tuple[RigSystem, Summary] | Rejected:  # fmt: skip
-    """Refits without corners beyond some σ, and without views that lose half of theirs; appends them, by camera.
+    """Refits without corners beyond some σ, and without views far worse than the others; appends them, by camera.
 
     Corners may come back: all are judged again by each new fit, until the choice stays.
 
     Returns:
         `nothing_fits` where no two views of a frame are left.
     """
-    lengths = np.concatenate(_lengths(system))
-    sigma = min(_spread_of(lengths), _WORSE * fit.alone_sigma)
-    if not lengths.max() > fit.reject_beyond_sigma * sigma:
+    lengths, full = _lengths(system), system.observations
+    sigma, limits = _limits(fit, full, lengths, fit.reject_beyond_sigma, None)
+    if not any(np.any(one > limit) for one, limit in zip(lengths, limits, strict=True)):
         return system, summary
-    full = system.observations
     # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
     judge = fit.system(full, system.estimate, "cauchy", 2 * sigma)
     minimize(judge, ROBUST)
     before: list[np.ndarray] | None = None
     for _ in range(_ROUNDS):
         lengths = _lengths(judge)
-        inliers = np.concatenate(lengths)
-        sigma = _spread_of(inliers if before is None else inliers[np.concatenate(before)])
-        sigma = min(sigma, _WORSE * fit.alone_sigma)
-        kept = [one <= fit.keep_within_sigma * sigma for one in lengths]
-        good = [_good_views(full, c, kept[c], lengths[c], sigma, fit.min_corners, views[c]) for c in range(len(kept))]
+        sigma, limits = _limits(fit, full, lengths, fit.keep_within_sigma, before)
+        kept = [one <= limit for one, limit in zip(lengths, limits, strict=True)]
+        good = []
+        for c, seen in enumerate(full.cameras):
+            belong, gone = views_that_belong(seen, kept[c], lengths[c], sigma, fit.min_corners, "disagrees")
+            good.append(belong)
+            views[c].extend(gone)
         changed = any(len(good[c]) < len(full.cameras[c]) for c in range(len(good)))
         if not changed and before is not None and all(np.array_equal(a, b) for a, b in zip(kept, before, strict=True)):
             break
@@ -118,21 +117,17 @@ def _of_views(observations: RigObservations, camera: int, mask: np.ndarray, kept
     return np.concatenate([np.zeros(0, bool), *(mask[offsets[v] : offsets[v + 1]] for v in kept)])
 
 
-def _good_views(
-    observations: RigObservations, camera: int, kept: np.ndarray, lengths: Vector, sigma: float, min_corners: int,
-    rejected: list[RejectedView],
-) -> list[int]:  # fmt: skip
-    """Views of one camera to go on with; appends the others, whose corners are mostly outliers."""
-    seen, good = observations.cameras[camera], []
-    for v, name in enumerate(seen.names):
-        inside = kept[seen.offsets[v] : seen.offsets[v + 1]]
-        if inside.sum() >= max(min_corners, 0.5 * len(inside)):
-            good.append(v)
-            continue
-        typical = float(np.median(lengths[seen.offsets[v] : seen.offsets[v + 1]]))
-        detail = f"{int((~inside).sum())} of {len(inside)} corners beyond limits; median {typical / sigma:.1f} sigma"
-        rejected.append(RejectedView(name, "disagrees", detail))
-    return good
+def _limits(
+    fit: RigFit, observations: RigObservations, lengths: Sequence[FloatArray], sigmas: float,
+    among: Sequence[np.ndarray] | None,
+) -> tuple[float, list[FloatArray]]:  # fmt: skip
+    """The standard deviation of all corners, and of each camera the lengths beyond which one is wrong."""
+    usual = [one if among is None else one[among[c]] for c, one in enumerate(lengths)]
+    sigma = min(spread_of(np.concatenate(usual)), _WORSE * fit.alone_sigma)
+    return sigma, [
+        limits_of(lengths[c], seen, sigmas, sigma, among=None if among is None else among[c])
+        for c, seen in enumerate(observations.cameras)
+    ]
 
 
 def _lengths(system: RigSystem) -> list[FloatArray]:
@@ -143,8 +138,3 @@ def _lengths(system: RigSystem) -> list[FloatArray]:
         lengths = np.hypot(a * r[:, 0] + b * r[:, 1], c * r[:, 1])
         found.append(np.where(np.isfinite(lengths), lengths, np.inf))
     return found
-
-
-def _spread_of(lengths: Vector) -> float:
-    """The standard deviation of a coordinate by the median length."""
-    return max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1e-9)

@@ -1,8 +1,8 @@
 """Which shape of the board predicts frames best that a rig has not seen.
 
-As `uncertainty_shapes` for one camera: the simplest shape whose error on held-out frames is within a standard error of
-the best one, all by the corners that the best fitting one keeps. A board that is bent and taken for flat bends cameras
-and baseline alike.
+As `uncertainty_shapes` for one camera: from the simplest on, a richer shape has to be clearly better on held-out frames
+and to generalise, all by the corners that the best fitting one keeps. A board that is bent and taken for flat bends
+cameras and baseline alike.
 """
 
 from __future__ import annotations
@@ -18,14 +18,18 @@ from calib.rig import RigCalibration, RigConfig, calibrate_rig
 from calib.rig_poses import BoardTurn
 from calib.rig_uncertainty import RigHeldOut, hold_out_frames
 from calib.rig_views import RigCamera
+from calib.uncertainty_choice import GENERALISES, generalises, is_clearly_lower, photos_needed, what_it_brings
 from calib.uncertainty_holdout import views_of
-from sfm.core.arrays import Points3D, Value
+from calib.uncertainty_shapes import NAMES
+from sfm.core.arrays import Points3D, Value, Vector
 from sfm.core.errors import Rejected
 
 CANDIDATES: tuple[ShapeKind, ...] = ("flat", "paraboloid", "free")
 """From the simplest to the richest."""
 _LARGEST_WORK = 1e10
 """Corners times squared number of coefficients, beyond which a shape takes minutes."""
+_CLEAR = 2.0
+"""Standard errors by which a richer shape has to be better."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -34,14 +38,22 @@ class RankedRig(Value):
 
     Attributes:
         found: with its own choice of corners.
-        held: errors on held-out frames, of the corners that the best fitting shape keeps.
-        refused: why there is no such rig, or why it is not judged.
+        held: errors on held-out frames, of the corners that the best fitting shape keeps; the chosen one by its own.
+        refused: why there is no such rig, or why it is not judged, or not to be chosen.
+        would_bring: of one that predicts clearly better than the chosen one: what, and what it would need, in a
+            sentence.
     """
 
     kind: ShapeKind
     found: RigCalibration | None = None
     held: RigHeldOut | None = None
     refused: str = ""
+    would_bring: str = ""
+
+    @property
+    def ratio(self) -> float:
+        """Error on held-out frames over that of the same frames in the fit."""
+        return math.nan if self.held is None else self.held.rms_px / max(self.held.training_rms_px, 1e-12)
 
     @property
     def held_out_rms_px(self) -> float:
@@ -76,8 +88,16 @@ def choose_rig_shape(
         return refusals[0] if refusals else Rejected("no_shape", "none was asked for")
     best = min(able, key=lambda found: found.sigma_px)
     judged = [_judged(board, row, best, cameras, config, folds, seed) for row in rows]
-    chosen = _chosen(judged)
-    return (chosen, *(row for row in judged if row is not chosen))
+    chosen, *others = _ranked(judged)
+    return (_by_its_own_corners(chosen, folds, seed), *others)
+
+
+def _by_its_own_corners(row: RankedRig, folds: int, seed: int) -> RankedRig:
+    """With the errors of frames held out at the corners that it is reported for."""
+    if row.found is None or row.held is None:
+        return row
+    held = hold_out_frames(row.found, folds=folds, rng=np.random.default_rng(seed))
+    return row if isinstance(held, Rejected) else dataclasses.replace(row, held=held)
 
 
 def _judged(
@@ -107,20 +127,40 @@ def _kept(best: RigCalibration, c: int, camera: RigCamera) -> RigCamera:
     return dataclasses.replace(camera, views=tuple(views_of(plain)), frames=frames)
 
 
-def _chosen(rows: Sequence[RankedRig]) -> RankedRig:
+def _ranked(rows: Sequence[RankedRig]) -> tuple[RankedRig, ...]:
     judged = [row for row in rows if row.found is not None and row.held is not None and row.found.converged]
     if not judged:
-        return next(row for row in rows if row.found is not None)
-    best = min(judged, key=lambda row: row.held_out_rms_px)
-    return next(row for row in judged if _as_good(row.held, best.held))
+        first = next(row for row in rows if row.found is not None)
+        return (first, *(row for row in rows if row is not first))
+    chosen, barred = judged[0], list[RankedRig]()
+    for row in judged[1:]:
+        if not is_clearly_lower(*_squares(row, chosen), _CLEAR):
+            continue
+        if generalises(row.ratio, chosen.ratio):
+            chosen = row
+        else:
+            barred.append(row)
+    told = [_told(row, chosen) if any(row is other for other in barred) else row for row in rows]
+    first = next(row for row in told if row.kind == chosen.kind)
+    return (first, *(row for row in told if row is not first))
 
 
-def _as_good(held: RigHeldOut | None, best: RigHeldOut | None) -> bool:
-    """Whether its frames, of those that both have, are worse by less than the standard error of the difference."""
-    assert held is not None
-    assert best is not None
-    _, at1, at2 = np.intersect1d(held.frames, best.frames, return_indices=True)
-    excess = held.squares[at1] - best.squares[at2]
-    if len(excess) < 2:
-        return True
-    return bool(excess.mean() <= excess.std(ddof=1) / math.sqrt(len(excess)))
+def _told(row: RankedRig, chosen: RankedRig) -> RankedRig:
+    """A shape that predicts frames better than a simpler one but does not generalise, with what it would bring."""
+    times = f"{row.ratio:.2f} times its error on the photos it was fitted to (up to {GENERALISES:g} is believed)"
+    squares = _squares(row, chosen)
+    brings = ""
+    if is_clearly_lower(*squares, _CLEAR):
+        errors = chosen.held_out_rms_px, row.held_out_rms_px
+        needs = photos_needed(len(squares[0]), row.ratio, "frames")
+        name, option = f"{NAMES[row.kind]} board shape", f"--shape {row.kind}"
+        brings = what_it_brings(name, errors, f"that is {times}", needs, option)
+    return dataclasses.replace(row, refused=f"that is {times}", would_bring=brings)
+
+
+def _squares(row: RankedRig, other: RankedRig) -> tuple[Vector, Vector]:
+    """Squared errors of both, of the frames that both have."""
+    assert row.held is not None
+    assert other.held is not None
+    _, at1, at2 = np.intersect1d(row.held.frames, other.held.frames, return_indices=True)
+    return row.held.squares[at1], other.held.squares[at2]

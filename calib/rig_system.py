@@ -252,7 +252,7 @@ class RigSystem:
             board = self._shape.points3D
         for c, (o, seen) in enumerate(zip(self.observations.cameras, self.observations.frame_of, strict=True)):
             model, params = self._cameras[c].model_info.model_id, point.params[c]
-            limit = distortion_limit(model, params) ** 2 if self._keep_invertible else math.inf
+            limit = distortion_limit(model, params) ** 2 if self._keep_invertible else -math.inf
             R, t = point.mounts[0][c], point.mounts[1][c]
             kernels.evaluate_views(
                 model, params, self._columns[c], limit, R @ point.frames[0][seen], point.frames[1][seen] @ R.T + t,

@@ -6,14 +6,13 @@ fitted. Its error is as free of the camera's own fit as a calibration in use.
 
     fold k holds out views k, k + K, k + 2K … of a random order; every view is held out once
 
-Two lens models are compared view by view, so that what they share cancels; the better one is no better if the mean of
-the differences is within its standard error, and then the one with fewer coefficients is preferred.
+Two lens models are compared view by view, so that what they share cancels; `uncertainty_choice` has the rule.
 
 `split_half` asks the other way round: how far do the cameras of two halves of the views differ? By how many pixels is
 measured over the image, with frames aligned.
 
 Reference:
-    Hastie, Tibshirani & Friedman, The Elements of Statistical Learning, 2nd ed. 2009, §7.10 (one standard error).
+    Hastie, Tibshirani & Friedman, The Elements of Statistical Learning, 2nd ed. 2009, §7.10.
     Kogan, mrcal, Cross-validation (documentation).
 """
 
@@ -31,6 +30,7 @@ from calib.refine_lenses import lens_by_name
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_views import BoardView, Observations
 from calib.uncertainty import pixel_grid, projection_difference
+from calib.uncertainty_choice import generalises, is_clearly_lower, photos_needed, what_it_brings
 from calib.zhang import poses_of_views
 from sfm.core.arrays import Points3D, Value, Vector
 from sfm.core.cameras import Camera
@@ -38,8 +38,8 @@ from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
 _POSES = StopRules(max_iterations=50, relative_cost_tolerance=1e-10, gradient_tolerance=0.0)
-_NEGLIGIBLE = 0.02
-"""Part of the squared error: a hundredth of the error is no reason for another coefficient."""
+_CLEAR = 1.0
+"""Standard errors by which a richer lens model has to be better."""
 CANDIDATES = ("pinhole", "simple_radial", "radial", "opencv4", "opencv5", "opencv8", "fisheye", "eucm")
 
 
@@ -162,6 +162,8 @@ class RankedLens(Value):
             error.
         differs_px: rms over the image of the difference to the chosen model, frames aligned.
         refused: why there is no such calibration; then the rest is NaN.
+        would_bring: of one that predicts clearly better than the chosen one: what, and what it would need, in a
+            sentence.
     """
 
     lens: str
@@ -173,7 +175,13 @@ class RankedLens(Value):
     differs_px: float = math.nan
     converged: bool = False
     refused: str = ""
+    would_bring: str = ""
     calibration: Calibration | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Error on held-out views over that of the fit."""
+        return self.held_out_rms_px / max(self.rms_px, 1e-12)
 
 
 def choose_lens(
@@ -182,8 +190,8 @@ def choose_lens(
 ) -> tuple[RankedLens, ...] | Rejected:  # fmt: skip
     """Lens models ranked by the error of held-out views, the chosen one first.
 
-    The chosen one has the fewest coefficients of those that converged to an error within a standard error, or a
-    hundredth, of the least.
+    From the model with the fewest coefficients on, one with more is taken if it converged, has clearly lower errors and
+    generalises; see `uncertainty_choice`. Models of wide lenses come after those of perspective ones.
     Corners that the best fitting model leaves out are left out for all, so that all are judged by the same.
 
     Returns:
@@ -242,24 +250,41 @@ def _common_corners(
 
 def _ranked(rows: list[RankedLens], held: dict[str, HeldOut]) -> tuple[RankedLens, ...]:
     # One that did not converge, or has no rays where no board was shown, has coefficients that the photos cannot bear.
-    sound = [row.lens for row in rows if row.lens in held and row.converged and _sees_whole_image(row)]
-    sound = sound or [row.lens for row in rows if row.lens in held and row.converged] or list(held)
-    best = min(sound, key=lambda name: held[name].rms_px)
-    judged = []
-    for row in rows:
-        if row.lens not in held:
-            judged.append(row)
-            continue
-        excess = held[row.lens].squares - held[best].squares
-        error = float(np.std(excess, ddof=1) / math.sqrt(len(excess))) if len(excess) > 1 else math.inf
-        judged.append(dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error))
-    negligible = _NEGLIGIBLE * float(np.mean(held[best].squares))
-    alike = [row for row in judged if row.lens in sound and row.excess <= max(row.excess_error, negligible)]
-    chosen = min(alike, key=lambda row: (row.coefficients, row.held_out_rms_px))
-    rest = sorted(
-        (row for row in judged if row is not chosen), key=lambda row: (bool(row.refused), row.held_out_rms_px)
-    )
-    return tuple(_compared(row, chosen) for row in (chosen, *rest))
+    sound = [row for row in rows if row.lens in held and row.converged and _sees_whole_image(row)]
+    sound = sound or [row for row in rows if row.lens in held and row.converged] or [r for r in rows if r.lens in held]
+    # Other programs read perspective models, so that wide ones have to be better than the best of those.
+    chosen, *others = sorted(sound, key=lambda row: (lens_by_name(row.lens).start == "wide", row.coefficients))
+    for row in others:
+        # One that predicts better than the other fits has not got there by its few coefficients alone.
+        is_believed = generalises(row.ratio, chosen.ratio) or row.held_out_rms_px < chosen.rms_px
+        if is_believed and is_clearly_lower(held[row.lens].squares, held[chosen.lens].squares, _CLEAR):
+            chosen = row
+    best = min(sound, key=lambda row: row.held_out_rms_px)
+    judged = [_judged(row, chosen, held[best.lens], held.get(row.lens), held[chosen.lens]) for row in rows]
+    first = next(row for row in judged if row.lens == chosen.lens)
+    rest = sorted((row for row in judged if row is not first), key=lambda row: (bool(row.refused), row.held_out_rms_px))
+    return tuple(_compared(row, first) for row in (first, *rest))
+
+
+def _judged(
+    row: RankedLens, chosen: RankedLens, best: HeldOut, held: HeldOut | None, held_chosen: HeldOut
+) -> RankedLens:
+    """How far a model is from the best one, and what it would bring if it was not taken though it predicts better."""
+    if held is None:
+        return row
+    excess = held.squares - best.squares
+    error = float(np.std(excess, ddof=1) / math.sqrt(len(excess))) if len(excess) > 1 else math.inf
+    row = dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error)
+    if row.lens == chosen.lens or not is_clearly_lower(held.squares, held_chosen.squares, _CLEAR):
+        return row
+    told = f"that is {row.ratio:.2f} times its error on the photos it was fitted to"
+    why = told, photos_needed(len(excess), row.ratio)
+    if not row.converged:
+        why = "it does not converge", "more photos"
+    elif not _sees_whole_image(row):
+        why = "it has no rays for the corners of the image", "photos with the board there"
+    brings = what_it_brings(row.lens, (chosen.held_out_rms_px, row.held_out_rms_px), *why, f"--model {row.lens}")
+    return dataclasses.replace(row, would_bring=brings)
 
 
 def _sees_whole_image(row: RankedLens) -> bool:

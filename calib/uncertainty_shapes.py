@@ -4,7 +4,7 @@ A board that is bent, or printed a little askew, taken for flat bends the camera
 eight sets of photos a camera from a board that is taken for flat is off by 2 to 10 times as much as one that is
 calibrated along with every point of the board, where these points lie as estimated there; where the board is flat, the
 latter costs 3 to 45 % (with 13 views of 24 corners 150 %). So shapes are judged as lens models are: by views that were
-held out, and the simplest within a standard error of the best is chosen.
+held out, from the simplest on, and a richer one has to be clearly better and to generalise; see `uncertainty_choice`.
 
 Held-out views are blind where camera and board may be exchanged for one another: boards that are all held alike, as
 in a second of video, are predicted well by a wrong pair of them. Then the camera is uncertain; shapes with which it is
@@ -25,8 +25,9 @@ from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_board import ShapeKind
 from calib.refine_views import BoardView
 from calib.uncertainty import covariance, uncertainty_map
+from calib.uncertainty_choice import GENERALISES, generalises, is_clearly_lower, photos_needed, what_it_brings
 from calib.uncertainty_holdout import HeldOut, hold_out, views_of
-from sfm.core.arrays import Points3D, Value
+from sfm.core.arrays import Points3D, Value, Vector
 from sfm.core.errors import Rejected
 
 CANDIDATES: tuple[ShapeKind, ...] = ("flat", "paraboloid", "free")
@@ -34,7 +35,13 @@ CANDIDATES: tuple[ShapeKind, ...] = ("flat", "paraboloid", "free")
 _LARGEST_WORK = 1e10
 """Corners times squared number of coefficients, beyond which a shape takes minutes."""
 _COST = 1.5
-"""Uncertainty of the camera over the least that it has with any shape, beyond which a shape is not chosen."""
+"""Uncertainty of the camera over that with a simpler shape, beyond which a shape is not chosen."""
+_CLEAR = 2.0
+"""Standard errors by which a richer shape has to be better."""
+NAMES: dict[ShapeKind, str] = {
+    "flat": "a flat", "scale": "a stretched", "paraboloid": "a bent", "height": "an uneven", "free": "a free",
+}  # fmt: skip
+"""What a board is called that has a shape."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +55,8 @@ class RankedShape(Value):
         excess, excess_error: mean over views of the squared error less that of the best shape, px², and its standard
             error.
         refused: why there is no such calibration, or why it is not to be chosen.
+        would_bring: of one that predicts clearly better than the chosen one: what, and what it would need, in a
+            sentence.
         calibration: with its own choice of corners.
     """
 
@@ -58,7 +67,13 @@ class RankedShape(Value):
     excess: float = math.nan
     excess_error: float = math.nan
     refused: str = ""
+    would_bring: str = ""
     calibration: Calibration | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Error on held-out views over that of the fit."""
+        return self.held_out_rms_px / max(self.rms_px, 1e-12)
 
     @property
     def held_out_rms_px(self) -> float:
@@ -129,23 +144,51 @@ def _camera_sigma(found: Calibration) -> float:
 
 
 def _ranked(rows: list[RankedShape]) -> tuple[RankedShape, ...]:
-    least = min((row.camera_sigma_px for row in rows if row.held is not None), default=math.inf)
-    judged = [_barred(row, least) for row in rows]
-    able = [row for row in judged if row.held is not None and not row.refused]
+    able = [row for row in rows if row.held is not None]
     if not able:  # too few views to judge by: the simplest that can be had
-        first = next(row for row in judged if row.calibration is not None)
-        return (first, *(row for row in judged if row is not first))
+        first = next(row for row in rows if row.calibration is not None)
+        return (first, *(row for row in rows if row is not first))
+    chosen, barred = able[0], dict[ShapeKind, tuple[str, str]]()
+    for row in able[1:]:
+        if not is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
+            continue
+        why = _why_not(row, chosen)
+        if why:
+            barred[row.kind] = why
+        else:
+            chosen = row
     best = min(able, key=lambda row: row.held_out_rms_px)
-    judged = [_compared(row, best) for row in judged]
-    chosen = next(row for row in judged if not row.refused and row.excess <= row.excess_error)
-    return (chosen, *(row for row in judged if row is not chosen))
+    judged = [_compared(row, best) for row in rows]
+    told = [_told(row, chosen, barred.get(row.kind)) for row in judged]
+    first = next(row for row in told if row.kind == chosen.kind)
+    return (first, *(row for row in told if row is not first))
 
 
-def _barred(row: RankedShape, least: float) -> RankedShape:
-    if row.held is None or not row.camera_sigma_px > _COST * least:
+def _squares(row: RankedShape) -> Vector:
+    assert row.held is not None
+    return row.held.squares
+
+
+def _why_not(row: RankedShape, simpler: RankedShape) -> tuple[str, str] | None:
+    """Why a shape that predicts better is not taken all the same, and what it would need."""
+    if row.camera_sigma_px > _COST * simpler.camera_sigma_px:
+        sigmas = row.camera_sigma_px, simpler.camera_sigma_px
+        told = f"the camera would be uncertain by {sigmas[0]:.2g} px rather than {sigmas[1]:.2g} px"
+        return told, "boards that are tilted in more directions"
+    if not generalises(row.ratio, simpler.ratio):
+        times = f"{row.ratio:.2f} times its error on the photos it was fitted to (up to {GENERALISES:g} is believed)"
+        return f"that is {times}", photos_needed(len(_squares(row)), row.ratio)
+    return None
+
+
+def _told(row: RankedShape, chosen: RankedShape, why: tuple[str, str] | None) -> RankedShape:
+    if why is None:
         return row
-    told = f"the camera would be uncertain by {row.camera_sigma_px:.2g} px rather than {least:.2g} px"
-    return dataclasses.replace(row, refused=told)
+    errors = chosen.held_out_rms_px, row.held_out_rms_px
+    brings = ""
+    if is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
+        brings = what_it_brings(f"{NAMES[row.kind]} board shape", errors, *why, f"--shape {row.kind}")
+    return dataclasses.replace(row, refused=why[0], would_bring=brings)
 
 
 def _compared(row: RankedShape, best: RankedShape) -> RankedShape:

@@ -139,6 +139,25 @@ def intrinsics_from_homographies(
     return Rejected("undetermined_focal", "; ".join(reasons))
 
 
+def centred_focal_lengths(matrices: FloatArray, width: int, height: int) -> tuple[float, float] | None:
+    """fx, fy in px from homographies (V, 3, 3) with the principal point at the centre of the image, None if implausible.
+
+    Each pair of orthogonal directions of a board, along its sides and along its diagonals, gives an equation of unit
+    directions, so that boards seen from afar weigh as much as those nearby. This is where OpenCV starts from.
+    """
+    to_centre = np.array([[1.0, 0, -width / 2], [0, 1.0, -height / 2], [0, 0, 1]])
+    H = to_centre @ matrices[np.isfinite(matrices).all((1, 2))]
+    x, y = H[:, :, 0], H[:, :, 1]
+    pairs = np.stack([np.stack([x, y]), np.stack([x + y, x - y])])
+    one, other = (pairs / np.linalg.norm(pairs, axis=3, keepdims=True)).swapaxes(0, 1).reshape(2, -1, 3)
+    products = one * other
+    found, _, rank, _ = np.linalg.lstsq(products[:, :2], -products[:, 2], rcond=None)
+    if rank < 2 or not np.all(found > 0):
+        return None
+    fx, fy = (1 / np.sqrt(found)).tolist()
+    return None if _implausible(fx, fy, 0.0, 0.0, width, height) else (fx, fy)
+
+
 def poses_of_views(
     observations: Observations, camera: Camera, *, robust: bool = False
 ) -> tuple[FloatArray, FloatArray, Vector]:
@@ -243,10 +262,10 @@ def _implausible(fx: float, fy: float, cx: float, cy: float, width: int, height:
 
 
 def _try_focal_lengths(observations: Observations, lens: Lens) -> Start | Rejected:
-    """The trial focal length whose rays fit homographies best, in px."""
+    """The trial focal length whose rays fit homographies best, in px, by some corners of some views."""
     width, height = observations.width, observations.height
     some = np.unique(np.linspace(0, len(observations) - 1, _VIEWS_TRIED).astype(int)).tolist()
-    views, best = observations.of_views(some), (math.inf, 0.0)
+    views, best = _thinned(observations.of_views(some)), (math.inf, 0.0)
     for focal in _TRIALS * max(width, height):
         camera = lens.camera(width, height, focal, focal, width / 2, height / 2)
         R, t, errors = poses_of_views(views, camera)

@@ -29,11 +29,11 @@ from calib.detect import Detection, detect_board
 from calib.refine import CalibrationConfig, calibrate
 from calib.refine_views import BoardView
 from calib.uncertainty import covariance
+from datasets.synthetic.boards import PARTS, SURROUND, texture
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from tests.calib.boards_in_view import PARTS, SURROUND, texture
 
 VIEWS, TEXELS_PER_M, MARGIN_PX = 15, 4000.0, 12
 

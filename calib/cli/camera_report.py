@@ -82,6 +82,7 @@ def camera_json(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Sug
         "board": {"spec": _spec(seen), "shape": found.shape.kind} | _board(found),
         "lenses": [_row(row, row.lens) for row in made.lenses],
         "shapes": [_row(row, row.kind) for row in made.shapes],
+        "would_bring": would_bring(made.lenses) + would_bring(made.shapes),
         seen.kind: {"count": seen.count, "digest": seen.digest},
         "views": _views(found),
         "rejected": [dataclasses.asdict(view) for view in made.left_out],
@@ -103,6 +104,7 @@ def camera_lines(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Su
     if made.lenses:
         yield from ("", "lens model      held-out  training  differs by px")
         yield from (_lens_line(row) for row in made.lenses)
+        yield from (f"  {sentence}" for sentence in would_bring(made.lenses))
     if made.left_out or found.rejected_corners:
         yield from ("", "left out", *_left_out_lines(made))
     if made.findings:
@@ -152,8 +154,15 @@ def _board_lines(made: CalibratedCamera) -> Iterator[str]:
             f"{1000 * board['bend_m']:.3g} mm from the lowest to the highest"
         )
     for row in made.shapes:
-        why = f"  not taken: {row.refused}" if row.refused else ""
+        why = f"  not taken{'' if row.would_bring else f': {row.refused}'}" if row.refused else ""
         yield f"  {row.kind:<12}held-out {_px(row.held_out_rms_px)} px{why}"
+    yield from (f"  {sentence}" for sentence in would_bring(made.shapes))
+
+
+def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
+    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
+    able = [row for row in rows if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _left_out_lines(made: CalibratedCamera) -> Iterator[str]:

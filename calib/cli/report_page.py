@@ -10,6 +10,7 @@ import numpy as np
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
+from calib.cli.camera_report import would_bring
 from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
 from calib.diagnose import Finding
 from calib.refine import Calibration
@@ -111,12 +112,14 @@ def _ranked(result: CalibratedCamera) -> Iterator[str]:
             [lens.lens, *([in_px(lens.rms_px), in_px(lens.held_out_rms_px), in_px(lens.differs_px)] if not lens.refused
              else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
+        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.lenses))
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
         yield table(["", "training", "held out", "uncertainty of the camera", ""], [
             [shape.kind, in_px(shape.rms_px), in_px(shape.held.rms_px if shape.held else np.nan),
              in_px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
+        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.shapes))
 
 
 def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:

@@ -108,7 +108,12 @@ def rig_json(
 
 def _shape_json(row: RankedRig) -> dict[str, Any]:
     held = row.held_out_rms_px
-    return {"kind": row.kind, "holdout_rms_px": held if math.isfinite(held) else None, "refused": row.refused}
+    return {
+        "kind": row.kind,
+        "holdout_rms_px": held if math.isfinite(held) else None,
+        "refused": row.refused,
+        "would_bring": row.would_bring,
+    }
 
 
 def _camera_json(
@@ -252,6 +257,13 @@ def _shape_lines(ranked: Sequence[RankedRig]) -> Iterator[str]:
             f"{row.kind} {row.held_out_rms_px:.4f} px" if row.held else f"{row.kind}: {row.refused}" for row in ranked
         )
         yield f"shapes of the board by held-out frames: {told}"
+        yield from (f"  {sentence}" for sentence in would_bring(ranked))
+
+
+def would_bring(ranked: Sequence[RankedRig]) -> list[str]:
+    """What the best of those shapes would bring that predict better than the one taken; at most one sentence."""
+    able = [row for row in ranked if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _left_out_lines(found: RigCalibration, seen: Mapping[str, Sightings]) -> Iterator[str]:

@@ -9,8 +9,8 @@ from calib.detect import DetectConfig, Detection, detect_board
 from calib.detect_circles import centre_shifts, curvature_shifts
 from calib.detect_neighbours import local_affines, predicted
 from calib.detect_overlay import overlay
+from datasets.synthetic import boards as views
 from sfm.core.errors import Rejected
-from tests.calib import boards_in_view as views
 
 CHESSBOARD = chessboard(9, 6, 0.025)
 CHARUCO = charuco(8, 6, 0.03, 0.022)

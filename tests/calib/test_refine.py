@@ -103,6 +103,28 @@ def test_a_smooth_fisheye_is_seen_by_a_model_with_two_shape_parameters(rng):
     assert abs(found.camera.mean_focal_length / FISHEYE.mean_focal_length - 1) < 0.01
 
 
+@pytest.mark.parametrize(("xi", "alpha"), [(-0.3, 0.55), (-0.1, 0.58), (0.25, 0.66), (0.5, 0.6)])
+def test_a_double_sphere_is_found_on_either_side_of_the_unified_camera(xi, alpha, rng):
+    camera = Camera("DOUBLE_SPHERE", 1280, 960, np.array([400 * (1 + xi), 402 * (1 + xi), 644, 473, xi, alpha]))
+    found = calibrated(views_of(camera, rng, noise_px=0.0), CalibrationConfig(lens="double_sphere"))
+    assert found.rms_px < 1e-9
+    np.testing.assert_allclose(found.camera.params, camera.params, rtol=1e-5)
+
+
+def test_a_unified_camera_leaves_xi_of_a_double_sphere_open_and_is_found():
+    camera = Camera("DOUBLE_SPHERE", 1280, 960, np.array([400, 402, 644, 473, 0.0, 0.6]))
+    found = calibrated(views_of(camera, np.random.default_rng(0)), CalibrationConfig(lens="double_sphere"))
+    assert found.fallbacks == ("xi is held at 0: the photos do not tell it from the focal length",)
+    assert "xi" not in found.free_names
+    np.testing.assert_allclose(found.camera.params, camera.params, rtol=2e-3)
+
+
+def test_a_double_sphere_sees_a_fisheye_about_as_well_as_the_enhanced_unified_model(rng):
+    views = views_of(FISHEYE, rng)
+    spheres, unified = (calibrated(views, CalibrationConfig(lens=lens)) for lens in ("double_sphere", "eucm"))
+    assert spheres.sigma_px < 1.5 * unified.sigma_px
+
+
 def test_the_noise_is_measured_free_of_what_parameters_absorb(rng):
     measured = [calibrated(views_of(LENS, rng, count=5, noise_px=0.2)).sigma_px for _ in range(12)]
     assert np.mean(measured) == pytest.approx(0.2, rel=0.03)
@@ -160,6 +182,15 @@ def test_corners_count_by_their_covariance(rng):
         return abs(calibrated(views).camera.params[0] - LENS.params[0])
 
     assert error(blurred) < 0.5 * error(plain)
+
+
+def test_the_problem_at_its_solution_is_the_one_that_was_solved():
+    """Where distortion may fold over, some corners have a projection that a camera in use would refuse."""
+    views = views_of(LENS, np.random.default_rng(7), count=6)
+    found = calibrated(views, dataclasses.replace(ALL, lens="opencv8", keep_invertible=False))
+    np.testing.assert_allclose(found.system().residuals(), found.residuals, atol=1e-9)
+    kept = dataclasses.replace(found, keep_invertible=True)
+    assert np.isnan(kept.system().residuals()).any()
 
 
 def test_one_iteration_is_not_convergence(rng):
@@ -243,6 +274,60 @@ def test_a_view_that_does_not_fit_is_named(rng):
     found = calibrated(views, CalibrationConfig(lens="opencv4"))
     assert [(view.name, view.reason) for view in found.rejected_views] == [("view04", "outlier_view")]
     assert found.sigma_px == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_photo_that_was_taken_while_the_board_moved_is_named(rng):
+    """Its lower rows are seen some milliseconds later than the upper ones, from elsewhere, and all are blurred."""
+    poses = poses_before(LENS, 14, rng)
+    moved = Rigid3(Rotation3.exp(np.array([0.02, -0.01, 0.03])), np.array([0.004, 0.001, 0.002])) @ poses[6]
+    views, later = seen(LENS, BOARD, poses, rng), seen(LENS, BOARD, [*poses[:6], moved], rng, 0.5)[6]
+    common = np.intersect1d(views[6].corner_ids, later.corner_ids)
+    at = [np.searchsorted(view.corner_ids, common) for view in (views[6], later)]
+    points2D = np.where(common[:, None] < 27, views[6].points2D[at[0]], later.points2D[at[1]])
+    views[6] = dataclasses.replace(views[6], corner_ids=common, points2D=points2D)
+    found = calibrated(views, CalibrationConfig(lens="opencv4"))
+    assert [(view.name, view.reason) for view in found.rejected_views] == [("view06", "outlier_view")]
+    assert found.sigma_px == pytest.approx(0.1, rel=0.1)
+
+
+def test_one_corner_that_is_a_pixel_off_is_left_out_alone(rng):
+    views = views_of(LENS, rng)
+    points2D = np.array(views[7].points2D)
+    points2D[20] += [0.8, -0.6]
+    views[7] = with_corners(views[7], points2D)
+    found = calibrated(views, CalibrationConfig(lens="opencv4"))
+    assert found.rejected_corners == (("view07", int(views[7].corner_ids[20])),)
+    assert not found.rejected_views
+
+
+@pytest.mark.parametrize("shape", ["flat", "free"])
+def test_a_photo_that_is_a_little_worse_than_very_good_ones_stays(shape, rng):
+    poses = poses_before(LENS, 14, rng, reach=0.15)
+    views = [*seen(LENS, BOARD, poses[:-1], rng, 0.05), *seen(LENS, BOARD, poses, rng, 0.15)[-1:]]
+    found = calibrated(views, CalibrationConfig(lens="opencv4", shape=shape))
+    assert found.rejected_views == ()
+    assert len(found.rejected_corners) <= 1
+
+
+def test_photos_of_different_sharpness_keep_their_corners(rng):
+    """By one measure for all, a twentieth of these corners would be beyond four standard deviations."""
+    poses = poses_before(LENS, 16, rng)
+    views = [
+        seen(LENS, BOARD, [pose], rng, noise)[0] for pose, noise in zip(poses, [0.03] * 10 + [0.1] * 6, strict=True)
+    ]
+    views = [dataclasses.replace(view, name=f"{v}") for v, view in enumerate(views)]
+    found = calibrated(views, CalibrationConfig(lens="opencv4"))
+    lengths = np.hypot(*found.residuals.T)
+    assert np.mean(lengths > 4 * np.median(lengths) / 1.177) > 0.02
+    assert len(found.rejected_corners) <= 1
+
+
+def test_a_view_of_which_most_is_wrong_is_left_out(rng):
+    views = views_of(LENS, rng)
+    views[2] = spoilt(views[2], rng, int(0.6 * len(views[2].corner_ids)), 15.0)
+    found = calibrated(views, CalibrationConfig(lens="opencv4"))
+    assert [view.name for view in found.rejected_views] == ["view02"]
+    assert "px off" in found.rejected_views[0].detail
 
 
 SWAPPED = np.arange(54).reshape(9, 6).T.ravel()

@@ -115,9 +115,12 @@ def test_a_step_solves_the_whole_normal_equations(damping, rng):
     expected = -np.linalg.solve(H + damping * np.diag(diagonal), g)
     L, Y, S = np.zeros((views, 6, 6)), np.empty((views, 6, shared + 1)), np.empty((shared + 1, shared + 1))
     by_pose, by_shared = np.empty((views, 6)), np.empty(shared)
-    assert kernels.solve_views(
+    square, slope, damped = kernels.solve_views(
         system.blocks, diagonal[: 6 * views].reshape(-1, 6), diagonal[6 * views :], damping, L, Y, S, by_pose, by_shared
     )
+    assert square == pytest.approx(expected @ expected, rel=1e-6)
+    assert slope == pytest.approx(g @ expected, rel=1e-9)
+    assert damped == pytest.approx(diagonal @ expected**2, rel=1e-6)
     scale = np.sqrt(diagonal)
     np.testing.assert_allclose(np.r_[by_pose.ravel(), by_shared] * scale, expected * scale, rtol=1e-6, atol=1e-8)
     np.testing.assert_allclose(
@@ -128,7 +131,19 @@ def test_a_step_solves_the_whole_normal_equations(damping, rng):
 def test_a_view_without_corners_cannot_be_solved():
     blocks = np.zeros((1, 8, 8))
     parts = np.zeros((1, 6, 6)), np.zeros((1, 6, 2)), np.zeros((2, 2)), np.zeros((1, 6)), np.zeros(1)
-    assert not kernels.solve_views(blocks, np.zeros((1, 6)), np.ones(1), 0.0, *parts)
+    assert np.all(np.isnan(kernels.solve_views(blocks, np.zeros((1, 6)), np.ones(1), 0.0, *parts)))
+
+
+def test_damping_is_by_the_diagonal_of_the_normal_matrix_and_never_zero(rng):
+    blocks = rng.uniform(0.1, 1.0, (3, 9, 9))
+    blocks[:, 7, 7] = 0.0  # a parameter that no view tells of
+    blocks[1, 2, 2] = 0.0
+    diagonal, shared_diagonal = np.empty((3, 6)), np.empty(2)
+    steepest = kernels.scale_views(blocks, 1e-3, 0.5, diagonal, shared_diagonal)
+    of_poses = np.diagonal(blocks, axis1=1, axis2=2)[:, :6]
+    np.testing.assert_allclose(diagonal, 0.5 * np.maximum(of_poses, 1e-3 * of_poses.max()))
+    np.testing.assert_allclose(shared_diagonal, [0.5 * blocks[:, 6, 6].sum(), 0.5])
+    assert steepest == pytest.approx(max(blocks[:, 8, :6].max(), blocks[:, 8, 6:8].sum(0).max()))
 
 
 def test_poses_move_by_the_exponential_on_the_left(rng):

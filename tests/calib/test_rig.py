@@ -154,6 +154,20 @@ def test_a_bent_board_is_told_by_held_out_frames(rng):
     assert flat[0].kind == "flat"
 
 
+def test_a_rig_s_board_of_too_many_numbers_for_the_frames_is_told_and_not_taken(rng):
+    rough = BOARD + rng.normal(0, 2e-4, BOARD.shape)
+    ranked = choose_rig_shape(BOARD, stereo(rng, count=12, board=rough), PLAIN)
+    assert not isinstance(ranked, Rejected)
+    free = next(row for row in ranked if row.kind == "free")
+    assert ranked[0].kind != "free"
+    assert ranked[0].ratio < 1.05 < free.ratio
+    assert free.held_out_rms_px < 0.5 * ranked[0].held_out_rms_px
+    assert free.would_bring.endswith("frames like these, or --shape free")
+    many = choose_rig_shape(BOARD, stereo(rng, count=30, board=rough), PLAIN)
+    assert not isinstance(many, Rejected)
+    assert many[0].kind == "free"
+
+
 def test_partners_lie_on_each_other_s_epipolar_curves(rng):
     exact = epipolar_errors(calibrated(stereo(rng, noise_px=0.0)), 0, 1)
     noisy = epipolar_errors(calibrated(stereo(rng, count=20, noise_px=0.2)), 0, 1)

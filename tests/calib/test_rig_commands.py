@@ -12,11 +12,11 @@ import pytest
 from calib.boards import chessboard
 from calib.cli.rig_options import CommonOptions, known_cameras, named_sources
 from calib.cli.robot_poses import read_robot_poses
+from datasets.synthetic.boards import DISTORTED, PINHOLE, pose, render
 from sfm.core.errors import ConfigError, FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.io.camera_files import write_camera_toml
 from sfm.io.rig_files import read_rig_file
-from tests.calib.boards_in_view import DISTORTED, PINHOLE, pose, render
 
 BOARD = chessboard(8, 6, 0.025)
 SPEC = "chessboard:8x6:25mm"

@@ -62,15 +62,17 @@ def project_lanes(model_id, params, squared_limit, w):
         _project_perspective(fx, fy, cx, cy, k1, k2, k3, d1, d2, d3, p1, p2, s1, s2, s3, s4, squared_limit, w)
         return
     by_point, by_params = np.empty((2, 3)), np.empty((2, MAX_PARAMS))
+    u, v, ok = 0.0, 0.0, False
     for n in range(LANES):
-        u, v, ok = project_point_jacobians(
-            model_id, params, w[X * LANES + n], w[Y * LANES + n], w[Z * LANES + n], by_point, by_params
-        )
+        x, y, z = w[X * LANES + n], w[Y * LANES + n], w[Z * LANES + n]
+        # Where there are fewer points than lanes, clients repeat the last.
+        if n == 0 or x != w[X * LANES + n - 1] or y != w[Y * LANES + n - 1] or z != w[Z * LANES + n - 1]:
+            u, v, ok = project_point_jacobians(model_id, params, x, y, z, by_point, by_params)
         w[U * LANES + n], w[V * LANES + n], w[OK * LANES + n] = (u, v, 1.0) if ok else (0.0, 0.0, 0.0)
         for r in range(2):
             for k in range(3):
                 w[(BY_POINT + 3 * r + k) * LANES + n] = by_point[r, k]
-            for k in range(MAX_PARAMS):
+            for k in range(len(params)):
                 w[(BY_PARAMS + 2 * k + r) * LANES + n] = by_params[r, k]
 
 

@@ -36,11 +36,8 @@ from sfm.core.arrays import FloatArray
 
 StopReason: TypeAlias = Literal["relative_cost", "gradient", "step", "max_iterations", "no_free_parameters"]
 
-_INITIAL_DAMPING = 1e-4
-_LEAST_FACTOR, _LEAST_FACTOR_OF_EXACT, _EXACT = 0.2, 0.04, 0.005
-_MIN_DAMPING, _MAX_DAMPING = 1e-10, 1e20
-"""Less changes no step, but rounding makes a matrix indefinite in directions that are free, as those of a scene are:
-with 1e-16 robust losses take up to twice the steps."""
+_INITIAL_DAMPING, _MAX_DAMPING = 1e-4, 1e20
+_EXACT = 0.005
 _FREE_DAMPING = 1.0
 """Above it a step is less than half of the undamped one, and a small decrease says nothing."""
 _MIN_GAIN = 1e-3
@@ -88,6 +85,22 @@ class StopRules:
     gradient_tolerance: float = 1e-10
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Damping:
+    """How the damping falls."""
+
+    least: float = 1e-10
+    """Less changes no step, but rounding makes a matrix indefinite in directions that are free, as those of a scene
+    are: with 1e-16 robust losses take up to twice the steps."""
+    least_factor: float = 0.2
+    """The most that a step takes off it; see the module."""
+    least_factor_of_exact: float = 0.04
+    """The same where the quadratic model was right."""
+
+
+USUAL_DAMPING = Damping()
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Iteration:
     """One row of the table: the state after a trial. Row 0 is the start.
@@ -127,7 +140,7 @@ class Summary:
         return self.iterations[-1].cost
 
 
-def minimize(system: System, rules: StopRules) -> Summary:
+def minimize(system: System, rules: StopRules, fall: Damping = USUAL_DAMPING) -> Summary:
     """Runs the loop on `system`, which holds the solution afterwards. The cost never rises."""
     cost, gradient = system.linearize()
     if gradient == 0:
@@ -146,8 +159,8 @@ def minimize(system: System, rules: StopRules) -> Summary:
         if accepted and reason is None:
             cost, gradient = system.linearize()
             reason = "gradient" if gradient == 0 else None
-            least = _LEAST_FACTOR_OF_EXACT if abs(gain - 1) < _EXACT else _LEAST_FACTOR
-            damping = max(_MIN_DAMPING, damping * max(least, 1 - (2 * min(gain, 1.5) - 1) ** 3))
+            least = fall.least_factor_of_exact if abs(gain - 1) < _EXACT else fall.least_factor
+            damping = max(fall.least, damping * max(least, 1 - (2 * min(gain, 1.5) - 1) ** 3))
             growth = 2.0
         elif not accepted:
             damping, growth = damping * growth, growth * 2

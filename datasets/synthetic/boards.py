@@ -72,8 +72,8 @@ def render(
     sign = np.array([1, -1]) if board.kind == "aprilgrid" else np.array([1, 1])
     place = (hits * sign + drawn.corners[0]) * texels_per_m - 0.5
     place[~(seen & (depth > 0))] = -1e6
-    maps = place.astype(np.float32).reshape(*x.shape, 2)
-    fine = cv2.remap(paint, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=SURROUND)
+    columns, rows = np.moveaxis(place.astype(np.float32).reshape(*x.shape, 2), 2, 0)
+    fine = cv2.remap(paint, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=SURROUND)
     fine = cv2.GaussianBlur(fine, (0, 0), blur_px * PARTS) if blur_px else fine
     image = fine.reshape(camera.height, PARTS, camera.width, PARTS).mean(axis=(1, 3))
     image = image + np.random.default_rng(seed).normal(0, noise, image.shape)
