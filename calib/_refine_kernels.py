@@ -16,25 +16,8 @@ from numba import njit
 
 from sfm.core.cameras._kernels import MAX_PARAMS, _scale_and_offset
 from sfm.core.cameras._lane_kernels import (
-    _A,
-    _A_DISTORTED,
-    _B,
-    _B_DISTORTED,
-    _D,
-    _G,
-    _S,
-    BY_PARAMS,
-    BY_POINT,
-    LANES,
-    OK,
-    U,
-    V,
-    X,
-    Y,
-    Z,
-    fill_by_param,
-    is_perspective,
-    project_lanes,
+    _A, _A_DISTORTED, _B, _B_DISTORTED, _D, _G, _S, BY_PARAMS, BY_POINT, LANES, OK, U, V, X, Y, Z, fill_by_param,
+    is_perspective, project_lanes,
 )  # fmt: skip
 from sfm.core.cameras._lane_kernels import ROWS as _CAMERA_ROWS
 from sfm.core.optim._loss_kernels import TRIVIAL, loss_and_weight
