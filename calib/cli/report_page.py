@@ -12,7 +12,6 @@ import numpy as np
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
-from calib.cli.camera_report import would_bring
 from calib.diagnose import Finding
 from calib.refine import Calibration
 from sfm.core.arrays import ImageU8
@@ -49,7 +48,7 @@ def report_page(
         f"<h1>{escape(name)}</h1>",
         f'<p class="quiet">{escape(_in_short(found))}</p>',
         *_findings(result.findings),
-        "<h2>How good it is</h2>", _quality(result),
+        "<h2>How good it is</h2>", _quality(result), *_would_bring(result),
         "<h2>Parameters</h2>", _parameters(result),
         *_ranked(result),
         "<h2>Where the photos showed the board</h2>",
@@ -110,6 +109,10 @@ def _quality(result: CalibratedCamera) -> str:
     return _table([], [[label, value] for label, value in rows])
 
 
+def _would_bring(result: CalibratedCamera) -> list[str]:
+    return [f"<p>{escape(sentence[:1].upper() + sentence[1:])}.</p>" for sentence in result.would_bring]
+
+
 def _parameters(result: CalibratedCamera) -> str:
     found = result.found
     plain, by_view = (
@@ -133,14 +136,12 @@ def _ranked(result: CalibratedCamera) -> Iterator[str]:
             [lens.lens, *([_px(lens.rms_px), _px(lens.held_out_rms_px), _px(lens.differs_px)] if not lens.refused
              else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
-        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.lenses))
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
         yield _table(["", "training", "held out", "uncertainty of the camera", ""], [
             [shape.kind, _px(shape.rms_px), _px(shape.held.rms_px if shape.held else np.nan),
              _px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
-        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.shapes))
 
 
 def _px(value: float) -> str:
