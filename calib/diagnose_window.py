@@ -125,9 +125,7 @@ def stated_finding(
     if not stated_px > max(_ABOVE * ours, ours + _VISIBLE_PX):
         return None
     smallest = crowding(observations, residuals).smallest_px
-    told = (
-        f"its own corners erred by {stated_px:.3f} px when it was calibrated; ours of these photos err by {ours:.3f} px"
-    )
+    told = f"its own corners erred by {stated_px:.3f} px when it was calibrated, ours of these photos by {ours:.3f} px"
     if not is_ours and _REACHED * smallest < _USUAL_WINDOW_PX:
         return Finding(
             "window_too_large",

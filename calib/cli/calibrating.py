@@ -100,6 +100,7 @@ class CalibratedCamera(Value):
         held_out, halves: errors on views that were held out, and the difference between the cameras of two halves.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
+        would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
     """
 
     found: Calibration
@@ -112,6 +113,7 @@ class CalibratedCamera(Value):
     halves: SplitHalf | Rejected
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
+    would_bring: tuple[str, ...] = ()
 
 
 def see_board(
@@ -234,7 +236,14 @@ def calibrate_camera(
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
         findings=_findings(seen, found),
+        would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
+
+
+def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
+    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
+    able = [row for row in rows if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _findings(seen: Sightings, found: Calibration) -> tuple[Finding, ...]:

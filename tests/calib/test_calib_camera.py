@@ -169,6 +169,8 @@ def test_a_shape_that_would_bring_more_is_told_in_one_sentence(sfm, tmp_path, rn
     assert sentence.startswith("a free board shape would bring the error of photos held out from")
     assert sentence.endswith("photos like these, or --shape free")
     assert sentence in sfm(*words, module="calib").stdout
+    assert sfm("report", "c.toml", "corners.json", "-o", "c.html", module="calib").returncode == 0
+    assert sentence[1:] in (tmp_path / "c.html").read_text()
 
 
 def test_resized_photos_are_checked_by_the_resized_camera(sfm, corners, tmp_path, rng):
