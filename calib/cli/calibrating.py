@@ -20,11 +20,12 @@ from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
+from calib.diagnose_window import window_finding
 from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
 from calib.refine_board import ShapeKind
-from calib.refine_views import BoardView
+from calib.refine_views import BoardView, gather
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, hold_out, split_half
+from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, fit_poses, hold_out, split_half
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
@@ -99,6 +100,7 @@ class CalibratedCamera(Value):
         held_out, halves: errors on views that were held out, and the difference between the cameras of two halves.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
+        would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
     """
 
     found: Calibration
@@ -111,6 +113,7 @@ class CalibratedCamera(Value):
     halves: SplitHalf | Rejected
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
+    would_bring: tuple[str, ...] = ()
 
 
 def see_board(
@@ -232,5 +235,20 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=diagnose(found),
+        findings=_findings(seen, found),
+        would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
+
+
+def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
+    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
+    able = [row for row in rows if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
+
+
+def _findings(seen: Sightings, found: Calibration) -> tuple[Finding, ...]:
+    """Of the corners all are looked at, whether they were left out or not: what they were left out for is a cause."""
+    alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
+    system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
+    window = window_finding(system.observations, system.residuals())
+    return (*filter(None, [window]), *diagnose(found))

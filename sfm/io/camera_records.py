@@ -15,6 +15,7 @@ sigma_px = 0.1262                 # of one coordinate
 holdout_rms_px = 0.1735           # as rms_px, of views that were held out
 split_half_px = 0.9               # difference of the cameras of two halves of the views, over the image
 converged = true
+would_bring = "a free board shape would bring …"   # what was not taken though it predicts photos better
 
 [uncertainty]
 free = ["fx", "fy", …]            # the parameters that were estimated
@@ -52,7 +53,7 @@ from sfm.core.errors import ConfigError
 
 Fact: TypeAlias = str | int | float | bool
 _FACTS: dict[type, tuple[str, ...]] = {
-    str: ("command", "date", "version", "lens", "kind", "photos_digest"),
+    str: ("command", "date", "version", "lens", "kind", "photos_digest", "would_bring"),
     int: ("photos", "views", "corners"),
     float: ("rms_px", "sigma_px", "holdout_rms_px", "split_half_px"),
     bool: ("converged",),
