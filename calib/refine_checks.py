@@ -26,14 +26,14 @@ Checked = tuple[CalibrationSystem, Summary, np.ndarray, tuple[str, ...]]
 
 def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> Checked | Rejected:
     """Holds the principal point where the views leave it open; refuses where they leave the focal length open."""
-    names = system.estimate.camera.model_info.param_names
+    camera = system.estimate.camera
+    names, mean = camera.model_info.param_names, camera.mean_focal_length
     columns, longer = fit.lens.columns(), max(system.observations.width, system.observations.height)
     deviations = _deviations(system, summary, [names[k] for k in columns])
     focal = [d for name, d in deviations.items() if name.startswith("f")]
     center = [d for name, d in deviations.items() if name.startswith("c")]
     fallbacks: tuple[str, ...] = ()
-    between, _, one_axis = _tilts(system.estimate.rotations)
-    mean = system.estimate.camera.mean_focal_length
+    between, tilt, one_axis = _tilts(system.rotations)
     if max(center) > _OPEN_CENTER * longer or max(focal) > _OPEN_FOCAL * mean:
         columns = np.array([k for k in columns if not names[k].startswith("c")])
         fallbacks = (f"the principal point is held at the centre of the image: {_tilts_in_words(system)}",)
@@ -47,10 +47,10 @@ def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> C
         system, summary = fit.solve(system.observations, estimate, columns)
         deviations = _deviations(system, summary, [names[k] for k in columns])
         focal = [d for name, d in deviations.items() if name.startswith("f")]
-        mean = system.estimate.camera.mean_focal_length
+        mean, tilt = system.estimate.camera.mean_focal_length, _tilts(system.rotations)[1]
     elif between < _PARALLEL or one_axis:
         fallbacks = (f"focal length and principal point rest on little: {_tilts_in_words(system)}",)
-    if _tilts(system.estimate.rotations)[1] < _FRONTAL:
+    if tilt < _FRONTAL:
         # The focal length and all distances may grow together, whatever the noise makes of it.
         return Rejected("undetermined_focal", _tilts_in_words(system))
     if not (max(focal) <= _OPEN_FOCAL * mean and mean < 20 * longer):
@@ -88,7 +88,7 @@ def _tilts(rotations: FloatArray) -> tuple[float, float, bool]:
 
 def _tilts_in_words(system: CalibrationSystem) -> str:
     """How the boards stand to one another and to the image, in degrees, and what would help."""
-    between, tilt, one_axis = _tilts(system.estimate.rotations)
+    between, tilt, one_axis = _tilts(system.rotations)
     views = f"all {len(system.observations)} views"
     if tilt < _FRONTAL:
         return f"{views} within {np.rad2deg(tilt):.0f}° of the image plane; tilt the board by 15° to 45° about two axes"

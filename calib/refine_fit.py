@@ -158,24 +158,35 @@ class Fit:
 def solve_from_start(
     fit: Fit, observations: Observations, homographies: Homographies
 ) -> tuple[CalibrationSystem, Summary] | Rejected:
-    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once`.
+    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once` and `Lens.rival`.
 
-    A minimum that is reached at once is taken for the right one. Where `keep_invertible` holds the solution back, it
-    depends on the way where that happens: the parameters are released in stages as well, and the lower cost wins.
+    The first minimum that is reached is taken for the right one. Where `keep_invertible` holds all of them back, the
+    lowest cost of those by stages wins: at once they are held back anywhere, far from anything.
     """
-    first = None
-    if fit.lens.at_once and not fit.has_gross_errors(homographies.errors):
-        estimate = fit.seed_at_once(observations, homographies)
-        if not isinstance(estimate, Rejected):
-            first = fit.solve(observations, estimate)
-            system, summary = first
-            if not fit.config.keep_invertible or system.is_at_minimum(summary.final_cost):
-                return first
-    estimate = fit.seed(observations, homographies.errors)
-    if isinstance(estimate, Rejected):
-        return first or estimate
-    second = fit.solve(observations, estimate)
-    return second if first is None or second[1].final_cost < first[1].final_cost else first
+    errors = homographies.errors
+    if fit.lens.at_once and not fit.has_gross_errors(errors):
+        found = _solved(fit, observations, fit.seed_at_once(observations, homographies))
+        held_back = fit.config.keep_invertible and not _is_at_minimum(found)
+        if not isinstance(found, Rejected) and not held_back:
+            return found
+    found = _solved(fit, observations, fit.seed(observations, errors))
+    if isinstance(found, Rejected) or not fit.lens.rival or _is_at_minimum(found):
+        return found
+    rival = dataclasses.replace(fit, lens=dataclasses.replace(fit.lens, stages=fit.lens.rival))
+    other = _solved(rival, observations, rival.seed(observations, errors))
+    if isinstance(other, Rejected) or found[1].final_cost <= other[1].final_cost:
+        return found
+    return other
+
+
+def _solved(
+    fit: Fit, observations: Observations, estimate: Estimate | Rejected
+) -> tuple[CalibrationSystem, Summary] | Rejected:
+    return estimate if isinstance(estimate, Rejected) else fit.solve(observations, estimate)
+
+
+def _is_at_minimum(solved: tuple[CalibrationSystem, Summary] | Rejected) -> bool:
+    return not isinstance(solved, Rejected) and solved[0].is_at_minimum(solved[1].final_cost)
 
 
 def _spread_over(views: int, most: int) -> list[int]:
