@@ -16,9 +16,26 @@ from numba import njit
 
 from sfm.core.cameras._kernels import MAX_PARAMS, _scale_and_offset
 from sfm.core.cameras._lane_kernels import (
-    _A, _A_DISTORTED, _B, _B_DISTORTED, _D, _G, _S, BY_PARAMS, BY_POINT, LANES, OK, U, V, X, Y, Z, fill_by_param,
-    is_perspective, project_lanes,
-)  # fmt: skip
+    _A,
+    _A_DISTORTED,
+    _B,
+    _B_DISTORTED,
+    _D,
+    _G,
+    _S,
+    BY_PARAMS,
+    BY_POINT,
+    LANES,
+    OK,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    fill_by_param,
+    is_perspective,
+    project_lanes,
+)
 from sfm.core.cameras._lane_kernels import ROWS as _CAMERA_ROWS
 from sfm.core.optim._loss_kernels import TRIVIAL, loss_and_weight
 
@@ -269,7 +286,7 @@ def _column(rows_of, k, w):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
-    """Fills D, `factor` times the diagonal of H but never zero, for the next functions; returns the gradient's largest entry.
+    """Fills D, `factor` times the diagonal of H but never zero; returns the largest entry of the gradient.
 
     A pose's part is at least `floor` of the largest of all poses.
     """
@@ -299,14 +316,14 @@ def scale_views(blocks, floor, factor, diagonal, shared_diagonal):
 def eliminate_views(blocks, diagonal, damping, L, Y, S):
     """Takes the poses out of (H + λD) δ = −g; False where a pose's block is not positive definite.
 
-    `diagonal` (V, 6) are the poses' part of D. Fills the factors L (V, 6, 6) of the blocks, Y = L⁻¹ [W | g] (V, 6, K + 1)
-    and the lower triangle of S (K + 1, K + 1): the reduced matrix, not yet damped, and in the last row its gradient.
+    `diagonal` (V, 6) are the poses' part of D. Fills the factors L (V, 6, 6) of the blocks, Y = L⁻¹ [W | g]
+    (V, 6, K + 1) and the lower triangle of S (K + 1, K + 1): the reduced matrix, not yet damped, its gradient last.
     """
     S[:] = 0.0
+    definite = True
     for view in range(len(blocks)):
-        if not _eliminate(blocks[view], diagonal[view], damping, L[view], Y[view], S):
-            return False
-    return True
+        definite = _eliminate(blocks[view], diagonal[view], damping, L[view], Y[view], S) and definite
+    return definite
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

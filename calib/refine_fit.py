@@ -20,6 +20,8 @@ from sfm.core.optim.losses import Loss
 _GROSS = 6.0
 """Worst homography over the median one, beyond which single corners are suspected of being far off."""
 _SEED_VIEWS = 14
+_MANY_VIEWS, _SEEDS_OF_MANY = 60, 40
+"""For `Lens.at_once`: fewer seeds have other minima than all views."""
 _SUSPICIOUS = 2.0
 """Times the median error of views beyond which the other pose of a plane is tried."""
 _NEAR = 1e-6
@@ -28,6 +30,7 @@ _ROUGH = StopRules(max_iterations=12, relative_cost_tolerance=1e-2, gradient_tol
 _SEEDED = StopRules(max_iterations=60, relative_cost_tolerance=1e-7, gradient_tolerance=0.0)
 _POSES = StopRules(max_iterations=5, relative_cost_tolerance=1e-3, gradient_tolerance=0.0)
 _PATIENT = StopRules(max_iterations=300, relative_cost_tolerance=1e-6, gradient_tolerance=0.0)
+_HALFWAY = StopRules(max_iterations=60, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
 _SLOW = Damping(least=1e-30, least_factor=1 / 3, least_factor_of_exact=1 / 3)
 """With the usual fall three times as many trials of `Lens.at_once` end above OpenCV's, and they take more steps."""
 ROBUST = StopRules(max_iterations=40, relative_cost_tolerance=1e-4, gradient_tolerance=0.0)
@@ -72,7 +75,7 @@ class Fit:
     def seed(self, observations: Observations, errors: Vector) -> Estimate | Rejected:
         """Camera and poses by releasing parameters in stages, on some of the views where there are many."""
         views = len(observations)
-        some = _spread_over(views)
+        some = _spread_over(views, _SEED_VIEWS)
         seeds = observations if len(some) == views else observations.of_views(some)
         gross = self.has_gross_errors(errors)
         estimate = self.placed(seeds, self.start.camera, gross)
@@ -91,30 +94,23 @@ class Fit:
         return estimate if len(some) == views else self.placed(observations, estimate.camera, gross)
 
     def seed_at_once(self, observations: Observations, homographies: Homographies) -> Estimate | Rejected:
-        """Camera and poses by releasing all parameters at once, roughly at first where there are many views."""
-        width, height = observations.width, observations.height
+        """Camera and poses by releasing all parameters at once, on some of the views where there are many."""
+        width, height, views = observations.width, observations.height, len(observations)
         focal = centred_focal_lengths(homographies.matrices, width, height)
         if self.start.rung == "given" or focal is None:
             camera = self.start.camera
         else:
             camera = self.lens.camera(width, height, *focal, width / 2, height / 2)
-        some = _spread_over(len(observations))
-        seeds = observations if len(some) == len(observations) else observations.of_views(some)
+        many = views > _MANY_VIEWS
+        seeds = observations.of_views(_spread_over(views, _SEEDS_OF_MANY)) if many else observations
         estimate = self.placed(seeds, camera, False)
         if isinstance(estimate, Rejected):
             return estimate
         poses = self.system(seeds, estimate, shaped=False, columns=np.zeros(0, np.int64))
         minimize(poses, _POSES)
-        estimate = poses.estimate
-        if len(some) < len(observations):
-            rough = self.system(seeds, estimate, shaped=False)
-            minimize(rough, _ROUGH, _SLOW)
-            estimate = self.placed(observations, rough.estimate.camera, False)
-            if isinstance(estimate, Rejected):
-                return estimate
-        system = self.system(observations, estimate, shaped=False)
-        minimize(system, _PATIENT, _SLOW)
-        return system.estimate
+        system = self.system(seeds, poses.estimate, shaped=False)
+        minimize(system, _HALFWAY if many else _PATIENT, _SLOW)
+        return self.placed(observations, system.estimate.camera, False) if many else system.estimate
 
     def has_gross_errors(self, errors: Vector) -> bool:
         """Whether single corners are suspected of being far off, by the errors of the views' homographies."""
@@ -162,39 +158,51 @@ class Fit:
 def solve_from_start(
     fit: Fit, observations: Observations, homographies: Homographies
 ) -> tuple[CalibrationSystem, Summary] | Rejected:
-    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once`.
+    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once` and `Lens.rival`.
 
-    A minimum that is reached at once is taken for the right one. Where `keep_invertible` holds the solution back, it
-    depends on the way where that happens: the parameters are released in stages as well, and the lower cost wins.
+    The first minimum that is reached is taken for the right one. Where `keep_invertible` holds all of them back, the
+    lowest cost of those by stages wins: at once they are held back anywhere, far from anything.
     """
-    first = None
-    if fit.lens.at_once and not fit.has_gross_errors(homographies.errors):
-        estimate = fit.seed_at_once(observations, homographies)
-        if not isinstance(estimate, Rejected):
-            first = fit.solve(observations, estimate)
-            system, summary = first
-            if not fit.config.keep_invertible or system.is_at_minimum(summary.final_cost):
-                return first
-    estimate = fit.seed(observations, homographies.errors)
-    if isinstance(estimate, Rejected):
-        return first or estimate
-    attempts = (first, fit.solve(observations, estimate), _with_other_shape(fit, observations, homographies.errors))
-    return min((one for one in attempts if one is not None), key=lambda one: one[1].final_cost)
+    errors = homographies.errors
+    if fit.lens.at_once and not fit.has_gross_errors(errors):
+        found = _solved(fit, observations, fit.seed_at_once(observations, homographies))
+        held_back = fit.config.keep_invertible and not _is_at_minimum(found)
+        if not isinstance(found, Rejected) and not held_back:
+            return found
+    found = _solved(fit, observations, fit.seed(observations, errors))
+    rival = _rival_of(fit, found)
+    if isinstance(found, Rejected) or rival is None:
+        return found
+    other = _solved(rival, observations, rival.seed(observations, errors))
+    if isinstance(other, Rejected) or found[1].final_cost <= other[1].final_cost:
+        return found
+    return other
 
 
-def _spread_over(views: int) -> list[int]:
+def _solved(
+    fit: Fit, observations: Observations, estimate: Estimate | Rejected
+) -> tuple[CalibrationSystem, Summary] | Rejected:
+    return estimate if isinstance(estimate, Rejected) else fit.solve(observations, estimate)
+
+
+def _is_at_minimum(solved: tuple[CalibrationSystem, Summary] | Rejected) -> bool:
+    return not isinstance(solved, Rejected) and solved[0].is_at_minimum(solved[1].final_cost)
+
+
+def _spread_over(views: int, most: int) -> list[int]:
     """Some views, or all where there are not many."""
-    return sorted(set(np.linspace(0, views - 1, min(views, _SEED_VIEWS)).astype(int).tolist()))
+    return sorted(set(np.linspace(0, views - 1, min(views, most)).astype(int).tolist()))
 
 
-def _with_other_shape(fit: Fit, observations: Observations, errors: Vector) -> tuple[CalibrationSystem, Summary] | None:
-    """From the other start, where the lens has one."""
-    if not fit.lens.other_shape:
+def _rival_of(fit: Fit, found: tuple[CalibrationSystem, Summary] | Rejected) -> Fit | None:
+    """The second attempt, where the lens has one and needs it."""
+    lens, start = fit.lens, fit.start
+    if lens.other_shape:
+        lens, camera = lens.from_other_shape(start.camera)
+        return dataclasses.replace(fit, lens=lens, start=dataclasses.replace(start, camera=camera))
+    if not lens.rival or _is_at_minimum(found):
         return None
-    lens, camera = fit.lens.from_other_shape(fit.start.camera)
-    other = dataclasses.replace(fit, lens=lens, start=dataclasses.replace(fit.start, camera=camera))
-    estimate = other.seed(observations, errors)
-    return None if isinstance(estimate, Rejected) else other.solve(observations, estimate)
+    return dataclasses.replace(fit, lens=dataclasses.replace(lens, stages=lens.rival))
 
 
 def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:

@@ -12,6 +12,7 @@ from calib.refine_board import board_shape
 from calib.refine_lenses import lens_by_name
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_views import BoardView, gather
+from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.optim.losses import evaluate_loss
@@ -44,7 +45,16 @@ def whitened(observations, camera, shape, R, t) -> np.ndarray:
     return np.stack([a * d[:, 0] + b * d[:, 1], c * d[:, 1]], 1)
 
 
-@pytest.mark.parametrize(("camera", "lens"), [(LENS, "opencv4"), (FISHEYE, "fisheye")], ids=["opencv", "fisheye"])
+PRISM = Camera(
+    "FULL_OPENCV_THIN_PRISM", 1280, 960,
+    np.array([900, 905, 644, 473, -0.2, 0.05, 1e-3, -5e-4, 0.01, 0.05, 0.02, 0.004, 2e-3, -1e-3, -3e-3, 1e-3]),
+)  # fmt: skip
+RADIAL = Camera("RADIAL", 1280, 960, np.array([1050.0, 651.0, 468.0, -0.21, 0.09]))
+
+
+@pytest.mark.parametrize(
+    ("camera", "lens"), [(LENS, "opencv4"), (PRISM, "opencv12"), (RADIAL, "radial"), (FISHEYE, "fisheye")]
+)
 def test_blocks_are_products_of_numeric_derivatives(camera, lens, rng):
     observations, estimate = problem(camera, rng)
     columns = lens_by_name(lens).columns()
@@ -114,9 +124,11 @@ def test_a_step_solves_the_whole_normal_equations(damping, rng):
     diagonal = np.diag(H).copy()
     expected = -np.linalg.solve(H + damping * np.diag(diagonal), g)
     L, Y, S = np.zeros((views, 6, 6)), np.empty((views, 6, shared + 1)), np.empty((shared + 1, shared + 1))
-    by_pose, by_shared = np.empty((views, 6)), np.empty(shared)
-    square, slope, damped = kernels.solve_views(
-        system.blocks, diagonal[: 6 * views].reshape(-1, 6), diagonal[6 * views :], damping, L, Y, S, by_pose, by_shared
+    of_poses, of_shared = diagonal[: 6 * views].reshape(-1, 6), diagonal[6 * views :]
+    by_pose, by_shared, straight = np.empty((views, 6)), np.empty(shared), np.zeros((shared, shared))
+    assert kernels.eliminate_views(system.blocks, of_poses, damping, L, Y, S)
+    square, slope, damped = kernels.step_views(
+        system.blocks, of_poses, of_shared, damping, L, Y, S, straight, np.zeros_like(S), by_pose, by_shared
     )
     assert square == pytest.approx(expected @ expected, rel=1e-6)
     assert slope == pytest.approx(g @ expected, rel=1e-9)
@@ -129,9 +141,48 @@ def test_a_step_solves_the_whole_normal_equations(damping, rng):
 
 
 def test_a_view_without_corners_cannot_be_solved():
-    blocks = np.zeros((1, 8, 8))
-    parts = np.zeros((1, 6, 6)), np.zeros((1, 6, 2)), np.zeros((2, 2)), np.zeros((1, 6)), np.zeros(1)
-    assert np.all(np.isnan(kernels.solve_views(blocks, np.zeros((1, 6)), np.ones(1), 0.0, *parts)))
+    assert not kernels.eliminate_views(
+        np.zeros((1, 8, 8)), np.zeros((1, 6)), 0.0, np.zeros((1, 6, 6)), np.zeros((1, 6, 2)), np.zeros((2, 2))
+    )
+
+
+def test_what_is_shared_and_not_determined_has_no_step():
+    blocks = np.eye(9)[None].copy()
+    blocks[0, 7, 7] = 0.0
+    L, Y, S = np.zeros((1, 6, 6)), np.zeros((1, 6, 3)), np.zeros((3, 3))
+    assert kernels.eliminate_views(blocks, np.ones((1, 6)), 0.0, L, Y, S)
+    parts = L, Y, S, np.zeros((2, 2)), np.zeros((3, 3)), np.zeros((1, 6)), np.zeros(2)
+    assert np.all(np.isnan(kernels.step_views(blocks, np.ones((1, 6)), np.ones(2), 0.0, *parts)))
+
+
+def random_definite(count: int, rng: np.random.Generator) -> np.ndarray:
+    root = rng.normal(size=(count, count))
+    return root @ root.T + 0.1 * np.eye(count)
+
+
+def test_a_secant_bends_the_matrix_as_the_gradient_has_grown(rng):
+    H, bend = random_definite(5, rng), random_definite(5, rng) - random_definite(5, rng)
+    step, gradient = rng.normal(size=5), rng.normal(size=5)
+    grown = (H + random_definite(5, rng)) @ step
+    S = np.zeros((6, 6))
+    S[:5, :5], S[5, :5] = np.tril(H), gradient + grown
+    lacking = grown - H @ step
+    sized = bend * min(1.0, abs(step @ lacking) / abs(step @ bend @ step))
+    rest = lacking - sized @ step
+    along = grown @ step
+    expected = sized + (np.outer(rest, grown) + np.outer(grown, rest)) / along
+    expected -= (rest @ step) * np.outer(grown, grown) / along**2
+    kernels.bend_by_secant(S, step, gradient, bend)
+    np.testing.assert_allclose(bend, expected, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose((H + bend) @ step, grown, rtol=1e-10)
+
+
+def test_a_gradient_that_does_not_grow_along_the_step_bends_nothing(rng):
+    H, step = random_definite(3, rng), rng.normal(size=3)
+    S, bend = np.zeros((4, 4)), np.zeros((3, 3))
+    S[:3, :3], S[3, :3] = np.tril(H), -step
+    kernels.bend_by_secant(S, step, np.zeros(3), bend)
+    np.testing.assert_array_equal(bend, 0.0)
 
 
 def test_damping_is_by_the_diagonal_of_the_normal_matrix_and_never_zero(rng):

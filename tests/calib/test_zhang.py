@@ -9,7 +9,13 @@ import pytest
 
 from calib.refine_lenses import lens_by_name
 from calib.refine_views import BoardView, gather
-from calib.zhang import find_start, fit_view_homographies, intrinsics_from_homographies, poses_of_views
+from calib.zhang import (
+    centred_focal_lengths,
+    find_start,
+    fit_view_homographies,
+    intrinsics_from_homographies,
+    poses_of_views,
+)
 from sfm.core.errors import Rejected
 from sfm.core.geometry.homography import fit_homography
 from sfm.core.geometry.rigid import Rigid3
@@ -71,6 +77,20 @@ def test_the_closed_form_is_exact_without_noise_and_distortion(rng):
     assert not isinstance(found, Rejected)
     np.testing.assert_allclose(found[0], PINHOLE.params, rtol=1e-8)
     assert found[1] == "closed_form"
+
+
+def test_focal_lengths_with_a_known_principal_point_are_exact_without_noise_and_distortion(rng):
+    centred = PINHOLE.with_params(np.array([1050.0, 1043.0, 640.0, 480.0]))
+    _, observations = made(centred, rng)
+    found = centred_focal_lengths(fit_view_homographies(observations).matrices, 1280, 960)
+    assert found is not None
+    np.testing.assert_allclose(found, [1050.0, 1043.0], rtol=1e-8)
+
+
+def test_boards_parallel_to_the_image_tell_no_focal_lengths(rng):
+    poses = [Rigid3(Rotation3.identity(), np.append(rng.uniform(-0.1, 0.1, 2), 0.5)) for _ in range(5)]
+    observations = gather(BOARD, seen(PINHOLE, BOARD, poses, rng, 0.0))
+    assert centred_focal_lengths(fit_view_homographies(observations).matrices, 1280, 960) is None
 
 
 def test_parallel_boards_climb_down_the_ladder(rng):

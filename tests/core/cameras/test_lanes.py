@@ -30,6 +30,7 @@ def test_lanes_equal_single_points(rng, model):
     params = params_of(model)
     points = rng.normal(size=(LANES, 3)) * [1, 1, 2] + [0, 0, 2]
     points[3], points[5], points[7], points[9] = np.nan, [1, 2, 0], [np.inf, 0, 1], [50, 0, 1]
+    points[-8:] = points[-9]  # where there are fewer points than lanes
     w = np.full(lanes.ROWS * LANES, np.nan)
     rows = w.reshape(-1, LANES)
     rows[:3] = points.T

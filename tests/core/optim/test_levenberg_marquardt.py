@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sfm.core.optim import StopRules, Trial, minimize
+from sfm.core.optim import Damping, StopRules, Trial, minimize
 from sfm.core.optim.levenberg_marquardt import steepness
 
 
@@ -70,6 +70,15 @@ def test_the_cost_never_rises_and_only_gains_are_accepted():
     for before, row in zip(summary.iterations[:-1], summary.iterations[1:], strict=True):
         assert row.accepted == (row.gain > 0)
         assert row.cost_change == pytest.approx(before.cost - row.cost, abs=1e-12)
+
+
+def test_the_damping_falls_no_faster_and_no_lower_than_it_may():
+    fall = Damping(least=1e-6, least_factor=0.5, least_factor_of_exact=0.25)
+    table = minimize(rosenbrock(), StopRules(), fall).iterations
+    damping = np.array([row.damping for row in table])
+    assert damping.min() == 1e-6
+    assert np.min(damping[1:] / damping[:-1]) >= 0.25
+    assert min(row.damping for row in minimize(rosenbrock(), StopRules()).iterations) < 1e-6
 
 
 def test_a_small_relative_decrease_ends_the_loop_where_the_gradient_is_small():
