@@ -216,7 +216,10 @@ def main(words: Sequence[str]) -> int:
         write_text(options.output / "frame.json", json.dumps(refined.frame.to_json(), indent=2) + "\n")
     if options.plot is not None:
         write_text(options.plot, convergence_svg(refined.result.table, f"sfm refine {options.model}"))
-    print(json.dumps(refined.to_json(), indent=2) if options.json else summary(refined, options.output))
+    if options.json:
+        print(json.dumps(refined.to_json(), indent=2))
+    else:
+        print(summary(refined, options.output, options.graduated))
     return ExitCode.OK
 
 
