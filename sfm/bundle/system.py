@@ -213,7 +213,8 @@ class BundleSystem:
         then.lost = int(lost)
         decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
         decrease += bound_decrease
-        norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
+        # Of cameras what may change: others, perhaps never used, may hold anything.
+        norm += _squared(row_centers) + len(row_centers) + _squared(now.params[self._places.cells])
         step_norm, norm = math.sqrt(step + _squared(delta)), math.sqrt(norm)
         return Trial(float(cost), float(decrease), step_norm, norm, self._steepness())
 

@@ -19,6 +19,7 @@ from sfm.bundle import (
     squared_errors,
     update_reconstruction,
 )
+from sfm.bundle.limits import check_scale
 from sfm.bundle.reconstruction import Intrinsics
 from sfm.core.arrays import BoolArray, FloatArray
 from sfm.core.cameras import Camera
@@ -70,8 +71,8 @@ class RefinementConfig:
     def __post_init__(self) -> None:
         for name in ("pixel_sigma", "focal_sigma", "principal_point_sigma", "distortion_sigma"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < np.inf:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
+            if value is not None:
+                check_scale(name, value)
         for name, now in (("focal_bounds", 1.0), ("principal_point_bounds", 0.0), ("distortion_bounds", None)):
             bounds = getattr(self, name)
             if bounds is None:

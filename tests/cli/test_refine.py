@@ -228,6 +228,8 @@ def test_models_that_cannot_be_adjusted_are_told(sfm, disturbed, tmp_path):
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--refine", "focus"), 2, "knows no 'focus'")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--loss", "l7"), 2, "choose one of trivial")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--loss-scale", "-1"), 2, "must be positive")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--focal-sigma", "1e-170"), 2, "focal_sigma must be positive")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", "--tolerance", "nan"), 2, "relative_cost_tolerance must lie")
     behind = pycolmap.Reconstruction(disturbed)
     for image_id in list(behind.images):
         frame = behind.images[image_id].frame
@@ -389,6 +391,12 @@ def test_measurements_that_will_not_do_are_told(sfm, disturbed, surveyed, tmp_pa
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--gps", tmp_path), 3, "says where it was taken")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--pixel-sigma", "0"), 2, "pixel_sigma must be positive")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--marks", table), 2, "of control points")
+    words = ("--positions", table, "--position-sigma", "1e-200")
+    assert_one_line(sfm("refine", disturbed, "-o", "out", *words), 2, "position_sigma must be positive")
+    header, *rows = table.read_text().splitlines()
+    (tmp_path / "bad.csv").write_text("\n".join([f"{header},sx,sy,sz", *(f"{row},1,1e-200,1" for row in rows)]))
+    result = sfm("refine", disturbed, "-o", "out", "--positions", "bad.csv")
+    assert_one_line(result, 3, "deviations of positions must be")
     (tmp_path / "bad.csv").write_text("name,x,y\na,1,2\n")
     assert_one_line(sfm("refine", disturbed, "-o", "out", "--positions", "bad.csv"), 3, "lacks z")
 
