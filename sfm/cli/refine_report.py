@@ -61,12 +61,25 @@ def _uncertainty_lines(refined: RefinedModel) -> list[str]:
         return []
     if isinstance(told, Rejected):
         return [f"no standard deviations: the observations leave open {refined.undetermined}"]
+    medians = [f"{name} ± {value:.2g}{unit}" for name, value, unit in _medians(refined) if math.isfinite(value)]
+    tables = f"{', '.join(medians) or 'nothing uncertain'} (medians; pose_sigmas.csv, point_sigmas.csv)"
     if told.keypoint_sigma_px == told.noise_px:
-        return [f"standard deviations for the noise that the residuals show, {told.noise_px:.3g} px"]
+        return [f"standard deviations for the noise that the residuals show, {told.noise_px:.3g} px", tables]
     stated = f"standard deviations for keypoints of {told.keypoint_sigma_px:g} px, as stated (--pixel-sigma); "
     if math.isnan(told.noise_px):
-        return [stated + "no observation is left over to tell their noise"]
-    return [stated + f"the residuals show {told.noise_px:.3g} px"]
+        return [stated + "no observation is left over to tell their noise", tables]
+    return [stated + f"the residuals show {told.noise_px:.3g} px", tables]
+
+
+def _medians(refined: RefinedModel) -> list[tuple[str, float, str]]:
+    found, unit = refined.median_sigmas, " units"
+    if refined.frame is not None:
+        unit = " m" if refined.frame.origin is not None else ""
+    return [
+        ("camera centres", found["centers"], unit),
+        ("rotations", found["rotations_deg"], "°"),
+        ("points", found["points"], unit),
+    ]
 
 
 def _measured_lines(frame: MeasuredFrame | None) -> list[str]:

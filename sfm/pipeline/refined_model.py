@@ -94,6 +94,9 @@ class RefinedModel:
                 "of_sigmas": self.uncertainty.keypoint_sigma_px,
                 "of_residuals": noise if math.isfinite(noise) else None,
             }
+            missing["median_sigmas"] = {
+                name: value if math.isfinite(value) else None for name, value in self.median_sigmas.items()
+            }
         if self.frame is not None:
             missing["frame"] = self.frame.to_json()
         return {
@@ -133,6 +136,33 @@ class RefinedModel:
             case _:
                 return f"camera {list(model.cameras)[row]}"
 
+    @property
+    def pose_sigmas(self) -> tuple[np.ndarray, np.ndarray]:
+        """(I, 3) standard deviations of centres along the axes of the world, and of rotations about those of the
+        cameras in degrees; 0 where a pose was held, NaN where no observation sees it."""
+        found = self._known.covariance
+        return _sigmas(found.centers), np.rad2deg(_sigmas(found.poses[:, :3, :3]))
+
+    @property
+    def point_sigmas(self) -> np.ndarray:
+        """(P, 3) those of the points; NaN where their views do not determine them."""
+        return _sigmas(self._known.covariance.points3D[: len(self.reconstruction.points3D)])
+
+    @property
+    def median_sigmas(self) -> dict[str, float]:
+        """Medians of the root sum of squares over three axes, of what was not held; NaN where all was."""
+        centers, rotations = self.pose_sigmas
+        return {
+            name: _median(np.linalg.norm(sigmas, axis=1))
+            for name, sigmas in (("centers", centers), ("rotations_deg", rotations), ("points", self.point_sigmas))
+        }
+
+    @property
+    def _known(self) -> Uncertainty:
+        if not isinstance(self.uncertainty, Uncertainty):
+            raise ValueError("the model has no standard deviations")
+        return self.uncertainty
+
     def camera_json(self, camera_id: int) -> dict[str, Any]:
         """The parameters of a camera by their names, and the standard deviations of those that were free."""
         camera = self.reconstruction.cameras[camera_id]
@@ -149,3 +179,14 @@ class RefinedModel:
             return None
         row = list(self.reconstruction.cameras).index(camera_id)
         return np.sqrt(np.diag(self.uncertainty.covariance.params[row]))
+
+
+def _sigmas(covariances: np.ndarray) -> np.ndarray:
+    """(N, k) the roots of the diagonals of covariances (N, k, k), in which rounding may leave less than nothing."""
+    variances = np.einsum("naa->na", covariances)
+    return np.sqrt(np.where(variances < 0, 0.0, variances))
+
+
+def _median(sigmas: np.ndarray) -> float:
+    known = sigmas[sigmas > 0]
+    return float(np.median(known)) if len(known) else math.nan

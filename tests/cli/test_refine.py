@@ -6,7 +6,9 @@ import dataclasses
 import importlib.util
 import json
 import re
+import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -198,6 +200,75 @@ def test_where_nothing_is_left_over_standard_deviations_are_those_stated(sfm, tm
     assert json.loads(result.stdout)["keypoint_sigma_px"] == {"of_sigmas": 1.0, "of_residuals": None}
     result = sfm("refine", "tiny", "-o", "out", "--refine", "none", "--sigmas", "--overwrite")
     assert "no observation is left over to tell their noise" in result.stdout
+
+
+def table_of(path: Path) -> tuple[list[str], np.ndarray]:
+    """First column, and the others; NaN where a cell is empty."""
+    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    return [row[0] for row in rows], np.array([[float(cell or "nan") for cell in row[1:]] for row in rows])
+
+
+@pytest.mark.parametrize("gauge", ["cameras", "points", "free"])
+def test_tables_beside_the_model_say_how_certain_poses_and_points_are(sfm, disturbed, tmp_path, gauge):
+    result = sfm("refine", disturbed, "-o", "out", "--refine", "focal", "--sigmas", "--gauge", gauge, "--json")
+    assert result.returncode == 0, result.stderr
+    names, poses = table_of(tmp_path / "out" / "pose_sigmas.csv")
+    ids, points = table_of(tmp_path / "out" / "point_sigmas.csv")
+    kinds: dict[str, Any] = {"cameras": "two_cameras", "points": "three_points", "free": "free"}
+    bundle = BundleConfig(relative_cost_tolerance=1e-8, gauge=kinds[gauge])
+    model = read_model(disturbed)
+    refined = refine_model(model, RefinementConfig(intrinsics=("focal",), bundle=bundle), with_covariance=True)
+    assert isinstance(refined.uncertainty, Uncertainty)
+    found = refined.uncertainty.covariance
+    assert tuple(names) == model.image_names
+    assert ids == [str(k) for k in model.point_ids]
+    np.testing.assert_allclose(poses[:, :3] ** 2, np.einsum("iaa->ia", found.centers), rtol=1e-4, atol=1e-12)
+    turns = np.einsum("iaa->ia", found.poses)[:, :3]
+    np.testing.assert_allclose(np.deg2rad(poses[:, 3:]) ** 2, turns, rtol=1e-4, atol=1e-12)
+    np.testing.assert_allclose(points**2, np.einsum("iaa->ia", found.points3D), rtol=1e-4, atol=1e-12)
+    assert np.sum(np.all(poses == 0, axis=1)) == (gauge == "cameras")
+    assert np.sum(np.all(points == 0, axis=1)) == 2 * (gauge == "points")
+    told = json.loads(result.stdout)["median_sigmas"]
+    lengths = np.linalg.norm(poses[:, :3], axis=1)
+    assert told["centers"] == pytest.approx(np.median(lengths[lengths > 0]), rel=1e-4)
+
+
+def test_tables_of_an_earlier_adjustment_go_with_its_model(sfm, disturbed, tmp_path):
+    """And those of a stranger stay: there is nothing to overwrite."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "frame.json").write_text("mine")
+    sfm("refine", disturbed, "-o", "out", "--sigmas", "--refine", "none", "--hold", "poses")
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".bin", ".csv", ".json"}
+    result = sfm("refine", disturbed, "-o", "out", "--overwrite", "--max-iterations", "1")
+    assert result.returncode == 0, result.stderr
+    assert {path.suffix for path in (tmp_path / "out").iterdir()} == {".bin"}
+
+
+def test_where_all_is_held_nothing_is_uncertain_and_nothing_warns(sfm, disturbed):
+    for held in ("poses", "poses,points"):
+        words = ("--refine", "none", "--hold", held, "--sigmas", "--overwrite")
+        result = sfm("refine", disturbed, "-o", "out", *words)
+        assert result.returncode == 0, result.stderr
+        assert "DPOTRI" not in result.stdout + result.stderr
+        assert ("nothing uncertain" in result.stdout) == (held != "poses")
+
+
+def test_a_workspace_has_a_place_for_its_adjusted_model(sfm, disturbed, tmp_path):
+    (tmp_path / "scene" / "sparse").mkdir(parents=True)
+    shutil.copytree(disturbed, tmp_path / "scene" / "sparse" / "0")
+    assert_one_line(sfm("refine", disturbed), 2, "-o is missing")
+    result = sfm("refine", "scene")
+    assert result.returncode == 0, result.stderr
+    assert read_model(tmp_path / "scene" / "refined").image_names == read_model(disturbed).image_names
+    assert_one_line(sfm("refine", "scene"), 3, "is there already")
+
+
+def test_a_file_in_the_way_is_told_before_anything_is_adjusted(sfm, disturbed, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for target in ("file", "file/in/it"):
+        result = sfm("refine", disturbed, "-o", target)
+        assert_one_line(result, 3, "is a file, not a folder")
+        assert "adjusting" not in result.stderr
 
 
 def test_a_summary_says_whether_it_has_converged(sfm, disturbed, tmp_path):
