@@ -38,6 +38,7 @@ from sfm.bundle.layout import Layout, lay_out
 from sfm.bundle.marginals import Marginals
 from sfm.bundle.problem import BundleConfig, BundleProblem
 from sfm.bundle.solver_plan import plan_solver
+from sfm.bundle.system import system_bytes
 from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
@@ -116,6 +117,7 @@ def covariance(
         drift = drift_of(problem, system) if not motions.shape[1] else None
     if drift is not None:
         problem = drift.problem
+        del system  # its memory is that of the next
         system, _ = system_of(problem, _with_factor(config), threads)
         motions = motions[: 6 * system.layout.rows]
     layout, (cost, _) = system.layout, system.linearize()
@@ -151,13 +153,16 @@ def covariance(
 
 
 def covariance_bytes(problem: BundleProblem, config: BundleConfig = BundleConfig()) -> int:
-    """About the memory that `covariance` takes, without taking it."""
+    """About the memory that `covariance` takes, without taking more of it than the layout of the problem."""
     layout = lay_out(problem, np.ones(len(problem.obs_images), bool))
     plan = plan_solver(layout, layout.padding, Knowledge(problem, layout).targets, _with_factor(config).solver)
+    system = system_bytes(layout, plan, len(problem.image_cameras), len(problem.points3D))
     blocks = 8 * BLOCK * BLOCK * len(plan.pattern.columns)
-    # Dense, the factor once more as a square, and its inverse.
-    square = 16 * int(np.sum(~layout.padding)) ** 2 if plan.forecast.kind == "dense" else 0
-    return plan.bytes + 3 * blocks + square + 200 * len(layout.image) + 300 * len(problem.points3D)
+    # The factor once more as a square, and its inverse; of a sparse one, those of its widest front and products.
+    square = 16 * int(np.sum(~layout.padding)) ** 2
+    if plan.forecast.fronts is not None:
+        square = 40 * int((plan.forecast.fronts.pivots + plan.forecast.fronts.rests).max(initial=0)) ** 2
+    return system + 3 * blocks + square + 72 * len(problem.points3D)
 
 
 def _with_factor(config: BundleConfig) -> BundleConfig:
