@@ -27,6 +27,12 @@ def placed(rng, sigma: float, bias_sigma: float, **kind) -> BundleProblem:
     )
 
 
+def prior_of(problem: BundleProblem) -> PositionPrior:
+    (prior,) = problem.priors
+    assert isinstance(prior, PositionPrior)
+    return prior
+
+
 def drifts(problem: BundleProblem, config: BundleConfig = BundleConfig()) -> bool:
     return drift_of(problem, system_of(problem, config, 1)[0]) is not None
 
@@ -57,7 +63,7 @@ def test_the_covariance_is_that_of_the_whole_normal_matrix(rng, gauge):
 @pytest.mark.parametrize("bias_sigma", [1e4, 1e9])
 def test_a_bias_of_which_hardly_anything_is_known_makes_the_place_of_the_scene_as_uncertain(rng, bias_sigma):
     problem = placed(rng, 1e-3, bias_sigma)
-    (prior,) = problem.priors
+    prior = prior_of(problem)
     still = known(dataclasses.replace(problem, priors=(dataclasses.replace(prior, bias_sigma=None),)))
     found = known(problem)
     np.testing.assert_allclose(np.einsum("iaa->ia", found.centers), bias_sigma**2, rtol=1e-6)
@@ -68,7 +74,7 @@ def test_a_bias_of_which_hardly_anything_is_known_makes_the_place_of_the_scene_a
 def test_the_bias_that_was_found_counts_where_deviations_have_a_robust_loss(rng):
     """Without it all positions would look wrong and count for little."""
     problem = placed(rng, 0.01, 5.0, loss="huber", loss_scale=3.0)
-    shifted = dataclasses.replace(problem.priors[0], positions=problem.priors[0].positions + [1.0, -2.0, 0.5])
+    shifted = dataclasses.replace(prior_of(problem), positions=prior_of(problem).positions + [1.0, -2.0, 0.5])
     result = adjust(dataclasses.replace(problem, priors=(shifted,)), TIGHT)
     without = adjust(problem, TIGHT)
     one, two = known(result.problem, biases=result.biases), known(without.problem)
@@ -86,7 +92,7 @@ def test_what_stands_still_or_lies_on_a_line_does_not_drift(rng):
     assert not drifts(dataclasses.replace(problem, free_poses=poses))
     assert not drifts(dataclasses.replace(problem, free_points=points))
     assert not drifts(dataclasses.replace(problem, priors=(*problem.priors, *problem.priors)))
-    (prior,) = problem.priors
+    prior = prior_of(problem)
     two = PositionPrior(prior.images[:2], prior.positions[:2], prior.covariances[:2], prior.bias_sigma)
     assert not drifts(dataclasses.replace(problem, priors=(two,)))
     known(dataclasses.replace(problem, priors=(two,)), BundleConfig(gauge="free"))
