@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from calib.board_turns import BoardTurn
 from calib.diagnose import Finding, diagnose_photos
 from calib.refine import Calibration
 from calib.refine_board import BoardShape
@@ -21,7 +22,7 @@ from calib.refine_reject import RejectedView
 from calib.refine_system import CalibrationSystem
 from calib.refine_views import BoardView, gather
 from calib.uncertainty import covariance
-from calib.uncertainty_holdout import fit_poses
+from calib.uncertainty_holdout import fit_poses, read_as_suits
 from sfm.core.arrays import Points3D, Value
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -70,7 +71,7 @@ class CameraCheck(Value):
 
 def check_camera(
     camera: Camera, shape: BoardShape, views: Sequence[BoardView], *, limit_px: float,
-    sigmas: Mapping[str, float] | None = None,
+    sigmas: Mapping[str, float] | None = None, turns: Sequence[BoardTurn] = (),
 ) -> CameraCheck | Rejected:  # fmt: skip
     """Compares photos of a board with a camera.
 
@@ -79,11 +80,12 @@ def check_camera(
         views: of the camera's size; others are left out.
         limit_px: rms error that is allowed.
         sigmas: standard deviations of the camera's parameters, where they are known.
+        turns: of the board that nothing printed on it tells apart; a view is read from the end that suits it best.
     Returns:
         `no_views` where none can be used, with the reason of the first.
     """
     usable, left_out = _sorted_out(camera, views)
-    observations = gather(shape.given, usable)
+    observations, _ = read_as_suits(camera, shape, gather(shape.given, usable), turns)
     system, seen = fit_poses(camera, shape, observations)
     left_out += [
         RejectedView(view.name, "no_pose", "its corners are not seen by this camera from anywhere")

@@ -73,6 +73,7 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CheckOptions, "check", words, EXAMPLES)
     _check_options(options)
 
+    from calib.board_turns import board_turns
     from calib.check import check_camera
     from calib.cli.calibrating import see_board
     from calib.cli.check_report import check_json, check_lines
@@ -92,7 +93,9 @@ def main(words: Sequence[str]) -> int:
         )  # fmt: skip
         camera, sigmas = _at_size(original, record, seen)
         limit = options.max_error or _limit(record)
-        checked = check_camera(camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas)
+        turns = board_turns(seen.board) if seen.board is not None else ()
+        shape = _shape(record, seen)
+        checked = check_camera(camera, shape, seen.views, limit_px=limit, sigmas=sigmas, turns=turns)
     if isinstance(checked, Rejected):
         raise no_check(seen, checked, options.images)
     factor = camera.width / original.width

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib.board_turns import board_turns
 from calib.boards import chessboard
 from calib.refine_views import BoardView
 from calib.rig import RigCalibration, RigConfig, calibrate_rig
 from calib.rig_epipolar import distances_from_curves, epipolar_errors
-from calib.rig_poses import board_turns
 from calib.rig_shapes import choose_rig_shape
 from calib.rig_views import RigCamera
 from sfm.core.errors import Rejected
