@@ -18,7 +18,7 @@ from calib.board_turns import BoardTurn
 from calib.diagnose import Finding, diagnose_photos
 from calib.refine import Calibration
 from calib.refine_board import BoardShape
-from calib.refine_reject import RejectedView
+from calib.refine_reject import RejectedView, without_copies
 from calib.refine_system import CalibrationSystem
 from calib.refine_views import BoardView, gather
 from calib.uncertainty import covariance
@@ -108,7 +108,8 @@ def check_camera(
 
 
 def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
-    usable, left_out = [], []
+    views, left_out = without_copies(views)
+    usable = []
     for view in views:
         if (view.width, view.height) != (camera.width, camera.height):
             detail = f"{view.width}x{view.height}, the camera has {camera.width}x{camera.height}"

@@ -267,7 +267,7 @@ def test_a_photo_that_is_there_twice_counts_once(rng):
     copy = dataclasses.replace(one.views[0], name="copy")
     twice = dataclasses.replace(one, views=(*one.views, copy), frames=(*one.frames, "99"))
     found = calibrated([twice, two])
-    assert [(view.name, view.reason) for view in found.rejected_views[0]] == [("copy", "copy")]
+    assert [(view.name, view.reason) for view in found.rejected_views[0]] == [("copy", f"copy_of {one.views[0].name}")]
     assert found.cost == calibrated([one, two]).cost
 
 
