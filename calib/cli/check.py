@@ -79,7 +79,7 @@ def main(words: Sequence[str]) -> int:
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
-    from calib.cli.refusals import no_check
+    from calib.cli.refusals import no_check, shown_size
     from calib.cli.suggestions_svg import suggestions_svg
     from sfm.io.atomic import write_text
 
@@ -91,6 +91,7 @@ def main(words: Sequence[str]) -> int:
             options.images, board, size=size, threads=options.threads, use_cache=not options.no_cache,
             observer=observer,
         )  # fmt: skip
+        finding = shown_size(seen, options.images)
         camera, sigmas = _at_size(original, record, seen)
         limit = options.max_error or _limit(record)
         turns = board_turns(seen.board) if seen.board is not None else ()
@@ -98,6 +99,8 @@ def main(words: Sequence[str]) -> int:
         checked = check_camera(camera, shape, seen.views, limit_px=limit, sigmas=sigmas, turns=turns)
     if isinstance(checked, Rejected):
         raise no_check(seen, checked, options.images)
+    if finding is not None:
+        checked = dataclasses.replace(checked, findings=(finding, *checked.findings))
     factor = camera.width / original.width
     suggested = further_photos(camera, record, seen, checked.found, resized_by=factor)
     if options.suggest:
