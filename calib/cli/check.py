@@ -74,12 +74,13 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CheckOptions, "check", words, EXAMPLES)
     _check_options(options)
 
+    from calib.board_turns import board_turns
     from calib.check import check_camera
     from calib.cli.calibrating import see_board
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
-    from calib.cli.refusals import no_check
+    from calib.cli.refusals import no_check, shown_size
     from calib.cli.suggestions_svg import suggestions_svg
     from sfm.io.atomic import write_text
 
@@ -91,15 +92,19 @@ def main(words: Sequence[str]) -> int:
             options.images, board, size=size, threads=options.threads, use_cache=not options.no_cache,
             observer=observer,
         )  # fmt: skip
+        finding = shown_size(seen, options.images)
         camera, sigmas = _at_size(original, record, seen)
         limit = options.max_error or _limit(record)
+        turns = board_turns(seen.board) if seen.board is not None else ()
         checked = check_camera(
             camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas,
             stated_px=record.number("rms_px") * camera.width / original.width,
-            is_ours=record.facts.get("kind") == "photos",
+            is_ours=record.facts.get("kind") == "photos", turns=turns,
         )  # fmt: skip
     if isinstance(checked, Rejected):
         raise no_check(seen, checked, options.images)
+    if finding is not None:
+        checked = dataclasses.replace(checked, findings=(finding, *checked.findings))
     factor = camera.width / original.width
     suggested = further_photos(camera, record, seen, checked.found, resized_by=factor)
     if options.suggest:
