@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from calib.diagnose import Finding, diagnose_photos
+from calib.diagnose_window import stated_finding, window_finding
 from calib.refine import Calibration
 from calib.refine_board import BoardShape
 from calib.refine_reject import RejectedView
@@ -70,7 +71,7 @@ class CameraCheck(Value):
 
 def check_camera(
     camera: Camera, shape: BoardShape, views: Sequence[BoardView], *, limit_px: float,
-    sigmas: Mapping[str, float] | None = None,
+    sigmas: Mapping[str, float] | None = None, stated_px: float = math.nan, is_ours: bool = False,
 ) -> CameraCheck | Rejected:  # fmt: skip
     """Compares photos of a board with a camera.
 
@@ -79,6 +80,7 @@ def check_camera(
         views: of the camera's size; others are left out.
         limit_px: rms error that is allowed.
         sigmas: standard deviations of the camera's parameters, where they are known.
+        stated_px, is_ours: rms error of the corners that it was calibrated with, and whether they were found here.
     Returns:
         `no_views` where none can be used, with the reason of the first.
     """
@@ -102,7 +104,12 @@ def check_camera(
     differences = tuple(_differences(check, lost, len(usable)))
     # Residuals of another camera are no longer white, whatever the board and the lens.
     of_photos = (f for f in diagnose_photos(found) if not (differences and f.cause in _BY_SHAPE))
-    return dataclasses.replace(check, findings=(*differences, *(f for f in of_photos if f.cause != "few_views")))
+    windows = (
+        window_finding(found.observations, found.residuals),
+        stated_finding(stated_px, found.observations, found.residuals, is_ours=is_ours),
+    )
+    findings = (*filter(None, windows), *differences, *(f for f in of_photos if f.cause != "few_views"))
+    return dataclasses.replace(check, findings=findings)
 
 
 def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:

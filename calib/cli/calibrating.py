@@ -20,11 +20,12 @@ from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
+from calib.diagnose_window import window_finding
 from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
 from calib.refine_board import ShapeKind
-from calib.refine_views import BoardView
+from calib.refine_views import BoardView, gather
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, hold_out, split_half
+from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, fit_poses, hold_out, split_half
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
@@ -232,5 +233,13 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=diagnose(found),
+        findings=_findings(seen, found),
     )
+
+
+def _findings(seen: Sightings, found: Calibration) -> tuple[Finding, ...]:
+    """Of the corners all are looked at, whether they were left out or not: what they were left out for is a cause."""
+    alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
+    system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
+    window = window_finding(system.observations, system.residuals())
+    return (*filter(None, [window]), *diagnose(found))

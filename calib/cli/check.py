@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -92,7 +93,11 @@ def main(words: Sequence[str]) -> int:
         )  # fmt: skip
         camera, sigmas = _at_size(original, record, seen)
         limit = options.max_error or _limit(record)
-        checked = check_camera(camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas)
+        checked = check_camera(
+            camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas,
+            stated_px=record.number("rms_px") * camera.width / original.width,
+            is_ours=record.facts.get("kind") == "photos",
+        )  # fmt: skip
     if isinstance(checked, Rejected):
         raise no_check(seen, checked, options.images)
     factor = camera.width / original.width
@@ -120,14 +125,17 @@ def _check_options(options: CheckOptions) -> None:
 
 def _read(path: Path) -> tuple[Camera, CameraRecord]:
     from sfm.io.camera_files import read_camera_file, read_intrinsics
-    from sfm.io.camera_records import CameraRecord
+    from sfm.io.camera_foreign import stated_error_px
+    from sfm.io.camera_records import CameraRecord, Fact
 
     if path.suffix.lower() == ".toml":
         return read_camera_file(path)
     cameras = read_intrinsics(path)
     if len(cameras) > 1:
         raise InputError(f"holds {len(cameras)} cameras", path=path, remedy="give a file with one camera")
-    return next(iter(cameras.values())), CameraRecord()
+    stated = stated_error_px(path)
+    facts: dict[str, Fact] = {"rms_px": stated} if math.isfinite(stated) else {}
+    return next(iter(cameras.values())), CameraRecord(facts)
 
 
 def _board_of_file(path: Path, record: CameraRecord) -> Board | None:

@@ -60,7 +60,8 @@ def check_lines(
     )
     trained, held = record.number("rms_px"), record.number("holdout_rms_px")
     if not math.isnan(trained):
-        yield f"when it was calibrated: {trained:.4f} px, {_px(held)} px on photos held out"
+        told = "" if math.isnan(held) else f", {held:.4f} px on photos held out"
+        yield f"when it was calibrated: {trained:.4f} px{told}"
     if _is_same(seen, record):
         yield "these are the very photos that it was calibrated from: the error says nothing of others"
     if check.changes:
@@ -87,10 +88,6 @@ def check_lines(
 
 def _is_same(seen: Sightings, record: CameraRecord) -> bool:
     return record.facts.get("photos_digest") == seen.digest
-
-
-def _px(value: float) -> str:
-    return "not known" if math.isnan(value) else f"{value:.4f}"
 
 
 def _finite(value: float) -> float | None:

@@ -6,6 +6,7 @@ OpenCV, ROS camera_info, Kalibr camchain, EuRoC sensor.yaml, BoofCV, nerfstudio 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ _READERS = (
     ("boofcv", is_boofcv, read_boofcv),
     ("nerfstudio", is_nerfstudio, read_nerfstudio),
 )
+_STATED = ("avg_reprojection_error", "reprojection_error", "rms", "RMS")
 _KNOWN = (
     "known are OpenCV (YAML, XML), ROS camera_info, Kalibr camchain, EuRoC, BoofCV, nerfstudio transforms.json, "
     "COLMAP cameras.txt or .bin, and the .toml files of Parallax"
@@ -61,6 +63,19 @@ def foreign_format(path: Path | str) -> str:
     except ValueError:
         return ""
     return _format(document) if isinstance(document, Mapping) else ""
+
+
+def stated_error_px(path: Path | str) -> float:
+    """Rms error of calibration that a file of OpenCV states, px; NaN where it does not."""
+    try:
+        document = _document(Path(path))
+    except ValueError:
+        return math.nan
+    known = document if isinstance(document, Mapping) else {}
+    for name in _STATED:
+        if isinstance(known.get(name), (int, float)):
+            return float(known[name])
+    return math.nan
 
 
 def _document(path: Path) -> Any:
