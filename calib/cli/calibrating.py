@@ -97,7 +97,7 @@ class CalibratedCamera(Value):
     Attributes:
         lenses, shapes: ranked, the chosen one first; empty where it was given.
         covariances, by_view: residuals taken for independent, and only views; see `uncertainty`.
-        held_out, halves: errors on views that were held out, and the difference between the cameras of two halves.
+        held_out, halves: errors on views that were held out, and the difference between the cameras of halves.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
     """
@@ -112,6 +112,11 @@ class CalibratedCamera(Value):
     halves: SplitHalf | Rejected
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
+
+    @property
+    def doubts(self) -> CalibrationCovariance | Rejected:
+        """What is told as uncertainty: by views, or, where these are too few for that, its lower bound."""
+        return self.covariances if isinstance(self.by_view, Rejected) else self.by_view
 
 
 def see_board(
@@ -222,24 +227,27 @@ def calibrate_camera(
     if held_out is None or held_out.counts.sum() != len(found.residuals):
         held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     halves = split_half(seen.points3D, found, config, rng=np.random.default_rng(plan.seed))
+    plain, by_view = covariance(found), covariance(found, by_view=True)
     observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
     return CalibratedCamera(
         found=found,
         config=config,
         lenses=lenses,
         shapes=shapes,
-        covariances=covariance(found),
-        by_view=covariance(found, by_view=True),
+        covariances=plain,
+        by_view=by_view,
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=_findings(seen, found),
+        findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
     )
 
 
-def _findings(seen: Sightings, found: Calibration) -> tuple[Finding, ...]:
+def _findings(
+    seen: Sightings, found: Calibration, doubts: CalibrationCovariance | Rejected
+) -> tuple[Finding, ...]:  # fmt: skip
     """Of the corners all are looked at, whether they were left out or not: what they were left out for is a cause."""
     alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
     system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
     window = window_finding(system.observations, system.residuals())
-    return (*filter(None, [window]), *diagnose(found))
+    return (*filter(None, [window]), *diagnose(found, doubts))
