@@ -38,6 +38,8 @@ _LARGEST_WORK = 1e10
 """Corners times squared number of coefficients, beyond which a shape takes minutes."""
 _COST = 1.5
 """Uncertainty of the camera over that with a simpler shape, beyond which a shape is not chosen."""
+_ROUNDS = 3
+"""Of corners and choice: mostly the first choice keeps the corners that it was judged by."""
 _CLEAR = 2.0
 """Standard errors by which a richer shape has to be better."""
 NAMES: dict[ShapeKind, str] = {
@@ -90,7 +92,8 @@ def choose_shape(
 ) -> tuple[RankedShape, ...] | Rejected:  # fmt: skip
     """Shapes by the error of held-out views, the chosen one first.
 
-    Corners that the best fitting one leaves out are left out for all.
+    Corners that one of them leaves out are left out for all: first the best fitting one's, then, if another is chosen,
+    the chosen one's, so that its errors are those of the camera that comes of it.
 
     Returns:
         what the first shape was refused for, where all are. Where views are too few to hold some out, the simplest
@@ -101,16 +104,28 @@ def choose_shape(
     if not good:
         first = fits[shapes[0]]
         return first if isinstance(first, Rejected) else Rejected("no_shape", "none was asked for")
-    best = min(good.values(), key=lambda fit: fit.sigma_px)
-    rows: list[RankedShape] = []
-    for kind in shapes:
-        fit = fits[kind]
-        if isinstance(fit, Rejected):
-            rows.append(RankedShape(kind, refused=f"{fit.reason}: {fit.detail}"))
-            continue
-        plain = dataclasses.replace(config, shape=kind, reject=False)
-        rows.append(_judged(board, fit, best, plain, folds, np.random.default_rng(seed)))
-    return _ranked(rows)
+    by = min(good.values(), key=lambda fit: fit.sigma_px)
+    ranked: tuple[RankedShape, ...] = ()
+    for _ in range(_ROUNDS):
+        rows: list[RankedShape] = []
+        for kind in shapes:
+            fit = fits[kind]
+            if isinstance(fit, Rejected):
+                rows.append(RankedShape(kind, refused=f"{fit.reason}: {fit.detail}"))
+                continue
+            plain = dataclasses.replace(config, shape=kind, reject=False)
+            rows.append(_judged(board, fit, by, plain, folds, np.random.default_rng(seed)))
+        ranked = _ranked(rows)
+        chosen = ranked[0].calibration
+        if ranked[0].held is None or chosen is None or _same_corners(chosen, by):
+            break
+        by = chosen
+    return ranked
+
+
+def _same_corners(one: Calibration, other: Calibration) -> bool:
+    a, b = one.observations, other.observations
+    return a.names == b.names and np.array_equal(a.offsets, b.offsets) and np.array_equal(a.rows, b.rows)
 
 
 def _fit(board: Points3D, views: Sequence[BoardView], config: CalibrationConfig) -> Calibration | Rejected:
@@ -124,7 +139,7 @@ def _judged(
     board: Points3D, fit: Calibration, best: Calibration, config: CalibrationConfig, folds: int,
     rng: np.random.Generator,
 ) -> RankedShape:  # fmt: skip
-    """A shape by the corners that the best one keeps."""
+    """A shape by the corners that the fit `best` keeps."""
     row = RankedShape(config.shape, calibration=fit)
     found = fit if fit is best else calibrate(board, views_of(best.observations), config)
     held = found if isinstance(found, Rejected) else hold_out(board, found, config, folds=folds, rng=rng)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -25,7 +26,16 @@ from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
 from calib.refine_board import ShapeKind
 from calib.refine_views import BoardView, gather
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, fit_poses, hold_out, split_half
+from calib.uncertainty_holdout import (
+    HeldOut,
+    RankedLens,
+    SplitHalf,
+    choose_lens,
+    fit_poses,
+    hold_out,
+    split_half,
+    views_of,
+)
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
@@ -98,6 +108,7 @@ class CalibratedCamera(Value):
         lenses, shapes: ranked, the chosen one first; empty where it was given.
         covariances, by_view: residuals taken for independent, and only views; see `uncertainty`.
         held_out, halves: errors on views that were held out, and the difference between the cameras of halves.
+        flat_px: error on views that were held out with the board taken for flat; NaN where it is not known.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
     """
@@ -112,6 +123,7 @@ class CalibratedCamera(Value):
     halves: SplitHalf | Rejected
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
+    flat_px: float = math.nan
 
     @property
     def doubts(self) -> CalibrationCovariance | Rejected:
@@ -240,7 +252,25 @@ def calibrate_camera(
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
         findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
+        flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
     )
+
+
+def _held_out_flat(
+    seen: Sightings, found: Calibration, config: CalibrationConfig, shapes: Sequence[RankedShape],
+    held_out: HeldOut | Rejected, plan: CameraPlan,
+) -> float:  # fmt: skip
+    """What photos of another board may err by, whose shape is not known."""
+    if config.shape == "flat":
+        return math.nan if isinstance(held_out, Rejected) else held_out.rms_px
+    if known := [row.held_out_rms_px for row in shapes if row.kind == "flat"]:
+        return known[0]
+    plain = dataclasses.replace(config, shape="flat", reject=False)
+    flat = calibrate(seen.points3D, views_of(found.observations), plain)
+    if isinstance(flat, Rejected):
+        return math.nan
+    held = hold_out(seen.points3D, flat, plain, folds=plan.folds, rng=np.random.default_rng(plan.seed))
+    return math.nan if isinstance(held, Rejected) else held.rms_px
 
 
 def _findings(

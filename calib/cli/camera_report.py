@@ -43,6 +43,7 @@ def record_of(made: CalibratedCamera, seen: Sightings, *, command: str) -> Camer
     for key, value in (
         ("sigma_px", found.sigma_px),
         ("holdout_rms_px", _held_out(made)),
+        ("holdout_flat_px", made.flat_px),
         ("split_half_px", _half(made)),
         ("uncertainty_px", (_reach(made) or {}).get("rms_px")),
     ):
@@ -103,7 +104,9 @@ def camera_lines(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Su
         yield "COLMAP lacks this model, so `sfm run` cannot use it; `calib convert --fit` makes one that it has"
     yield from ("", *_parameter_lines(made), "", *_error_lines(made), "", *_board_lines(made))
     if made.lenses:
-        yield from ("", "lens model      held-out  training  differs by px")
+        bent = " and with a board that may be bent" if made.shapes else ""
+        yield from ("", f"lens models, compared at the corners that the best fitting one keeps{bent}")
+        yield "  lens model    held-out  training  differs by px"
         yield from (_lens_line(row) for row in made.lenses)
         yield from (f"  {sentence}" for sentence in would_bring(made.lenses))
     if made.left_out or found.rejected_corners:

@@ -13,6 +13,7 @@ corners = 756
 rms_px = 0.1679                   # root of the mean squared length of residuals
 sigma_px = 0.1262                 # of one coordinate
 holdout_rms_px = 0.1735           # as rms_px, of views that were held out
+holdout_flat_px = 0.1735          # the same with the board taken for flat
 split_half_px = 0.9               # difference of the cameras of two halves of the views, over the image
 uncertainty_px = 0.4              # standard deviation of a pixel far away, over the image, by views if they are enough
 converged = true
@@ -55,7 +56,7 @@ Fact: TypeAlias = str | int | float | bool
 _FACTS: dict[type, tuple[str, ...]] = {
     str: ("command", "date", "version", "lens", "kind", "photos_digest"),
     int: ("photos", "views", "corners"),
-    float: ("rms_px", "sigma_px", "holdout_rms_px", "split_half_px", "uncertainty_px"),
+    float: ("rms_px", "sigma_px", "holdout_rms_px", "holdout_flat_px", "split_half_px", "uncertainty_px"),
     bool: ("converged",),
 }
 FACTS: Mapping[str, type] = MappingProxyType({key: kind for kind, keys in _FACTS.items() for key in keys})

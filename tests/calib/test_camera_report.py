@@ -78,3 +78,30 @@ def test_halves_differ_by_about_twice_the_uncertainty_by_views(rng):
         assert not isinstance(made.halves, Rejected)
         ratios.append(made.halves.rms_px / rms_uncertainty(made.found, made.by_view))
     assert 1.3 < np.median(ratios) < 3.2
+
+
+def test_the_error_of_held_out_photos_is_one_number_whatever_was_left_out(rng):
+    """A bent board with corners that only the right shape knows for outliers."""
+    bend = 0.0012 * (1 - (CENTRED[:, :1] / 0.1) ** 2) * [0, 0, 1.0]
+    views = seen(LENS, CENTRED + bend, poses_before(LENS, 14, rng), rng)
+    for k in (2, 5, 9):
+        points = np.array(views[k].points2D)
+        points[7 * k % 40] += [1.1, -0.9]
+        views[k] = with_corners(views[k], points)
+    shown = Sightings(BOARD, BOARD.points3D, tuple(views), (), "digest")
+    made = made_of(shown, shape="auto")
+    told = camera_json(made, shown, ())
+    assert told["holdout_rms_px"] == told["shapes"][0]["holdout_rms_px"]
+    assert told["rms_px"] == pytest.approx(told["shapes"][0]["rms_px"], rel=1e-6)
+    flat = next(row for row in told["shapes"] if row["name"] == "flat")
+    assert record_of(made, shown, command="").number("holdout_flat_px") == flat["holdout_rms_px"]
+
+
+def test_the_error_with_a_flat_board_is_told_for_a_shape_that_was_given(rng):
+    bend = 0.0012 * (1 - (CENTRED[:, :1] / 0.1) ** 2) * [0, 0, 1.0]
+    shown = Sightings(
+        BOARD, BOARD.points3D, tuple(seen(LENS, CENTRED + bend, poses_before(LENS, 12, rng), rng)), (), ""
+    )
+    made = made_of(shown, shape="paraboloid")
+    assert not isinstance(made.held_out, Rejected)
+    assert made.flat_px > 1.5 * made.held_out.rms_px
