@@ -126,6 +126,9 @@ def _check_options(options: CheckOptions) -> None:
         raise ConfigError(f"--max-error must be positive, got {options.max_error:g}")
     if options.suggest and options.suggest.suffix.lower() != ".svg":
         raise ConfigError(f"--suggest must end in .svg, got {options.suggest}")
+    from sfm.io.atomic import check_writable
+
+    check_writable(options.suggest)
 
 
 def _read(path: Path) -> tuple[Camera, CameraRecord]:
