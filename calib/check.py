@@ -38,7 +38,14 @@ _SUSPICIOUS = 3.0
 _FAILED = 0.5
 """More views than this part that are not seen or far off are no outliers."""
 _BY_SHAPE = ("bent_board", "lens_model", "correlated_corners")
-GRAVE = ("error_above_limit", "focal_length_differs", "principal_point_differs", "lens_or_board_differs", "no_pose")
+GRAVE = (
+    "error_above_limit",
+    "focal_length_differs",
+    "principal_point_differs",
+    "lens_or_board_differs",
+    "no_pose",
+    "other_size",
+)
 """Causes for which a check fails."""
 
 
@@ -104,7 +111,7 @@ def check_camera(
     free_rms = changed.rms_px if changed is not None else math.nan
     check = CameraCheck(found, found.rms_px, limit_px, free_rms, changes, tuple(left_out), ())
     lost = sum(view.reason == "no_pose" for view in left_out)
-    differences = tuple(_differences(check, lost, len(usable)))
+    differences = (*_of_sizes(camera, left_out, len(views)), *_differences(check, lost, len(usable)))
     # Residuals of another camera are no longer white, whatever the board and the lens.
     of_photos = (f for f in diagnose_photos(found) if not (differences and f.cause in _BY_SHAPE))
     window = window_finding(found.observations, found.residuals)
@@ -193,6 +200,15 @@ def _compared(
         difference = float(changed.camera.params[names.index(name)] - camera.params[names.index(name)])
         changes[name] = difference, math.hypot(sigma, sigmas.get(name, 0.0))
     return changes
+
+
+def _of_sizes(camera: Camera, left_out: Sequence[RejectedView], total: int) -> Iterator[Finding]:
+    others = sum(view.reason == "other_size" for view in left_out)
+    if others > _FAILED * total:
+        yield Finding(
+            "other_size", f"{others} of {total} photos are not of {camera.width} × {camera.height} px",
+            "name photos as the camera takes them at these settings, uncropped; resized ones all by the same",
+        )  # fmt: skip
 
 
 def _differences(check: CameraCheck, lost: int, total: int) -> Iterator[Finding]:

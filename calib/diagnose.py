@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from calib.refine import Calibration
-from calib.uncertainty import covariance, uncertainty_map
+from calib.uncertainty import CalibrationCovariance, covariance, uncertainty_map
 from sfm.core.arrays import FloatArray, Points2D, Value, Vector
 from sfm.core.errors import Rejected
 
@@ -96,11 +96,16 @@ def board_tilts(found: Calibration) -> tuple[Vector, Vector]:
     return np.arccos(np.clip(normals[:, 2], -1, 1)), np.arctan2(normals[:, 1], normals[:, 0])
 
 
-def diagnose(found: Calibration) -> tuple[Finding, ...]:
-    """What is wrong, the gravest first; nothing where nothing was found."""
-    return tuple(
-        finding for part in (_solution, _views, _poses, _shape_of_residuals, _reach) for finding in part(found)
-    )
+def diagnose(
+    found: Calibration, doubts: CalibrationCovariance | Rejected | None = None
+) -> tuple[Finding, ...]:  # fmt: skip
+    """What is wrong, the gravest first; nothing where nothing was found.
+
+    Args:
+        doubts: how uncertain it is; by default by views, or its lower bound where these are too few.
+    """
+    told = (finding for part in (_solution, _views, _poses, _shape_of_residuals) for finding in part(found))
+    return (*told, *_reach(found, _doubts(found) if doubts is None else doubts))
 
 
 def diagnose_photos(found: Calibration) -> tuple[Finding, ...]:
@@ -203,8 +208,12 @@ def _shape_of_residuals(found: Calibration) -> Iterator[Finding]:
         )
 
 
-def _reach(found: Calibration) -> Iterator[Finding]:
-    covariances = covariance(found)
+def _doubts(found: Calibration) -> CalibrationCovariance | Rejected:
+    by_view = covariance(found, by_view=True)
+    return covariance(found) if isinstance(by_view, Rejected) else by_view
+
+
+def _reach(found: Calibration, covariances: CalibrationCovariance | Rejected) -> Iterator[Finding]:
     if isinstance(covariances, Rejected):
         yield Finding(covariances.reason, covariances.detail, f"take a lens model with less than {found.lens} has")
         return

@@ -162,6 +162,13 @@ def uncertainty_map(
     return worst_deviations(projection_covariances(calibration, covariances, pixels, distance)).reshape(shape), pixels
 
 
+def rms_uncertainty(calibration: Calibration, covariances: CalibrationCovariance, across: int = 24) -> float:
+    """Of `uncertainty_map` for what is far away, over the pixels that have a ray; inf where none has."""
+    deviations, _ = uncertainty_map(calibration, covariances, across=across)
+    seen = deviations[np.isfinite(deviations)]
+    return math.sqrt(float(np.mean(seen**2))) if len(seen) else math.inf
+
+
 def pixel_grid(camera: Camera, across: int = 40) -> tuple[Points2D, tuple[int, int]]:
     """Centres of square cells that cover the image, so many across, row by row; and how many down and across."""
     down = max(1, round(across * camera.height / camera.width))

@@ -71,20 +71,41 @@ def _guarded(name: str, words: list[str]) -> int:
     """Runs a command; what goes wrong becomes one line and an exit code."""
     _settle_threads_and_kernels()
     try:
-        return importlib.import_module(f"calib.cli.{name}").main(words)
+        code = importlib.import_module(f"calib.cli.{name}").main(words)
+        sys.stdout.flush()
+        return code
     except SfmError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("\ninterrupted; what was found is kept, so that a repetition goes on from there", file=sys.stderr)
-        return ExitCode.INTERRUPTED
+        return _interrupted()
     except BrokenPipeError:  # the reader, e.g. `head`, has seen enough
         sys.stdout = None
         return ExitCode.OK
     except SystemExit as error:  # tyro has printed help, or what is wrong with the options
         return error.code if isinstance(error.code, int) else ExitCode.USAGE
+    except OSError as error:
+        return _bug(error) if error.filename is not None else _no_output(error)
     except Exception as error:
         return _bug(error)
+
+
+def _no_output(error: OSError) -> int:
+    """Files say what is wrong by themselves (see `sfm.io.atomic`): this was the screen, or where it is sent to."""
+    sys.stdout = None  # Python would try again at the end
+    print(f"error: standard output: {(error.strerror or str(error)).lower()}", file=sys.stderr)
+    return ExitCode.BAD_INPUT
+
+
+def _interrupted() -> int:
+    """Ends at once: photos that are being looked at would take seconds, and nobody wants them any more."""
+    from sfm.core.execution import has_abandoned
+
+    if has_abandoned():
+        sys.stderr.flush()
+        os._exit(ExitCode.INTERRUPTED)
+    return ExitCode.INTERRUPTED
 
 
 def _settle_threads_and_kernels() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -26,7 +27,16 @@ from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
 from calib.refine_board import ShapeKind
 from calib.refine_views import BoardView, gather
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf, choose_lens, fit_poses, hold_out, split_half
+from calib.uncertainty_holdout import (
+    HeldOut,
+    RankedLens,
+    SplitHalf,
+    choose_lens,
+    fit_poses,
+    hold_out,
+    split_half,
+    views_of,
+)
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
@@ -98,7 +108,8 @@ class CalibratedCamera(Value):
     Attributes:
         lenses, shapes: ranked, the chosen one first; empty where it was given.
         covariances, by_view: residuals taken for independent, and only views; see `uncertainty`.
-        held_out, halves: errors on views that were held out, and the difference between the cameras of two halves.
+        held_out, halves: errors on views that were held out, and the difference between the cameras of halves.
+        flat_px: error on views that were held out with the board taken for flat; NaN where it is not known.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
         would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
@@ -115,6 +126,12 @@ class CalibratedCamera(Value):
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
     would_bring: tuple[str, ...] = ()
+    flat_px: float = math.nan
+
+    @property
+    def doubts(self) -> CalibrationCovariance | Rejected:
+        """What is told as uncertainty: by views, or, where these are too few for that, its lower bound."""
+        return self.covariances if isinstance(self.by_view, Rejected) else self.by_view
 
 
 def see_board(
@@ -226,19 +243,21 @@ def calibrate_camera(
     if held_out is None or held_out.counts.sum() != len(found.residuals):
         held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     halves = split_half(seen.points3D, found, config, rng=np.random.default_rng(plan.seed))
+    plain, by_view = covariance(found), covariance(found, by_view=True)
     observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
     return CalibratedCamera(
         found=found,
         config=config,
         lenses=lenses,
         shapes=shapes,
-        covariances=covariance(found),
-        by_view=covariance(found, by_view=True),
+        covariances=plain,
+        by_view=by_view,
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=_findings(seen, found),
+        findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
+        flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
     )
 
 
@@ -248,9 +267,28 @@ def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
     return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
-def _findings(seen: Sightings, found: Calibration) -> tuple[Finding, ...]:
+def _held_out_flat(
+    seen: Sightings, found: Calibration, config: CalibrationConfig, shapes: Sequence[RankedShape],
+    held_out: HeldOut | Rejected, plan: CameraPlan,
+) -> float:  # fmt: skip
+    """What photos of another board may err by, whose shape is not known."""
+    if config.shape == "flat":
+        return math.nan if isinstance(held_out, Rejected) else held_out.rms_px
+    if known := [row.held_out_rms_px for row in shapes if row.kind == "flat"]:
+        return known[0]
+    plain = dataclasses.replace(config, shape="flat", reject=False)
+    flat = calibrate(seen.points3D, views_of(found.observations), plain)
+    if isinstance(flat, Rejected):
+        return math.nan
+    held = hold_out(seen.points3D, flat, plain, folds=plan.folds, rng=np.random.default_rng(plan.seed))
+    return math.nan if isinstance(held, Rejected) else held.rms_px
+
+
+def _findings(
+    seen: Sightings, found: Calibration, doubts: CalibrationCovariance | Rejected
+) -> tuple[Finding, ...]:  # fmt: skip
     """Of the corners all are looked at, whether they were left out or not: what they were left out for is a cause."""
     alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
     system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
     window = window_finding(system.observations, system.residuals())
-    return (*filter(None, [window]), *diagnose(found))
+    return (*filter(None, [window]), *diagnose(found, doubts))

@@ -129,6 +129,9 @@ def _checked(options: CameraOptions) -> Board | None:
     if options.focal is not None and not 1 <= options.focal <= 1e6:
         raise ConfigError(f"--focal must be a length in px, got {options.focal:g}")
     _plan(options)
+    from sfm.io.atomic import check_writable
+
+    check_writable(options.output, options.suggest)
     return board_of(options.board) if options.board else None
 
 

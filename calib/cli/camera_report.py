@@ -16,7 +16,7 @@ from calib.cli.calibrating import CalibratedCamera, Sightings, would_bring
 from calib.cli.suggestions_text import suggestion_lines, suggestions_json
 from calib.next_views import SuggestedView
 from calib.refine import Calibration
-from calib.uncertainty import CalibrationCovariance, uncertainty_map
+from calib.uncertainty import CalibrationCovariance, rms_uncertainty, uncertainty_map
 from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf
 from calib.uncertainty_shapes import RankedShape
 from sfm.core.errors import Rejected
@@ -43,7 +43,9 @@ def record_of(made: CalibratedCamera, seen: Sightings, *, command: str) -> Camer
     for key, value in (
         ("sigma_px", found.sigma_px),
         ("holdout_rms_px", _held_out(made)),
+        ("holdout_flat_px", made.flat_px),
         ("split_half_px", _half(made)),
+        ("uncertainty_px", (_reach(made) or {}).get("rms_px")),
     ):
         if value is not None and math.isfinite(value):
             facts[key] = value
@@ -105,7 +107,9 @@ def camera_lines(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Su
         yield "COLMAP lacks this model, so `sfm run` cannot use it; `calib convert --fit` makes one that it has"
     yield from ("", *_parameter_lines(made), "", *_error_lines(made), "", *_board_lines(made))
     if made.lenses:
-        yield from ("", "lens model      held-out  training  differs by px")
+        bent = " and with a board that may be bent" if made.shapes else ""
+        yield from ("", f"lens models, compared at the corners that the best fitting one keeps{bent}")
+        yield "  lens model    held-out  training  differs by px"
         yield from (_lens_line(row) for row in made.lenses)
         yield from (f"  {sentence}" for sentence in would_bring(made.lenses))
     if made.left_out or found.rejected_corners:
@@ -139,12 +143,15 @@ def _error_lines(made: CalibratedCamera) -> Iterator[str]:
     if held is not None:
         yield f"held-out    {_px(held)}  of photos that the camera was calibrated without"
     if half is not None:
-        yield f"split-half  {_px(half)}  between the cameras of two halves of the photos, over the image"
+        yield f"split-half  {_px(half)}  between the cameras of two halves of the photos, over the image (median)"
     if reach is not None:
+        by = "by views" if reach["by"] == "views" else "at least: all corners taken for independent"
         yield (
-            f"uncertainty {_px(reach['rms_px'])}  of a pixel far away, one standard deviation; "
+            f"uncertainty {_px(reach['rms_px'])}  of a pixel far away, one standard deviation {by}; "
             f"worst {reach['worst_px']:.2g} near ({reach['worst_at'][0]:.0f}, {reach['worst_at'][1]:.0f})"
         )
+    if reach is not None and reach["by"] == "views":
+        yield f"  at least  {_px(reach['bound_px'])}  if all corners were independent, which they are not"
     yield from (f"not known: {what}, {reason}" for what, reason in why.items())
 
 
@@ -218,10 +225,10 @@ def _sigmas(covariances: CalibrationCovariance | Rejected, names: Iterable[str])
 
 
 def _reach(made: CalibratedCamera) -> dict[str, Any] | None:
-    """Uncertainty of pixels over the image."""
-    if isinstance(made.covariances, Rejected):
+    """Uncertainty of pixels over the image: by views where they are enough, and its lower bound."""
+    if isinstance(made.covariances, Rejected) or isinstance(made.doubts, Rejected):
         return None
-    deviations, pixels = uncertainty_map(made.found, made.covariances, across=24)
+    deviations, pixels = uncertainty_map(made.found, made.doubts, across=24)
     if not np.isfinite(deviations).any():
         return None
     worst = int(np.nanargmax(deviations))
@@ -230,6 +237,8 @@ def _reach(made: CalibratedCamera) -> dict[str, Any] | None:
         "worst_px": float(deviations.ravel()[worst]),
         "worst_at": pixels[worst].tolist(),
         "distance": "infinite",
+        "by": "corners" if isinstance(made.by_view, Rejected) else "views",
+        "bound_px": rms_uncertainty(made.found, made.covariances),
     }
 
 
@@ -256,7 +265,7 @@ def _row(row: RankedLens | RankedShape, name: str) -> dict[str, Any]:
     if isinstance(row, RankedLens):
         values |= {"differs_px": _finite(row.differs_px), "converged": row.converged}
     else:
-        values |= {"camera_sigma_px": _finite(row.camera_sigma_px)}
+        values |= {"camera_bound_px": _finite(row.camera_bound_px)}
     return values | ({"refused": row.refused} if row.refused else {})
 
 

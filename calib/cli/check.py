@@ -17,7 +17,6 @@ from sfm.core.errors import ConfigError, ExitCode, InputError, Rejected
 if TYPE_CHECKING:
     from calib.boards import Board
     from calib.cli.calibrating import Sightings
-    from calib.refine_board import BoardShape
     from sfm.core.cameras import Camera
     from sfm.io.camera_records import CameraRecord
 
@@ -26,9 +25,6 @@ EXAMPLES = (
     "calib check camera.toml photos --board board.toml --suggest next.svg",
     "calib check camera.toml photos --max-error 0.3 --json",
 )
-_TOLERANCE = 2.0
-"""Times the held-out error of the calibration that other photos may have: light and blur differ."""
-_UNKNOWN_PX = 1.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +42,7 @@ class CheckOptions:
     """Folders of photos, or photos, best such as it was not calibrated with; or corners, as in `calib camera`."""
 
     board: Annotated[str, tyro.conf.arg(metavar="BOARD", help_behavior_hint="(default: that of the camera file)")] = ""
-    """What is in the photos; with the shape that the camera file has for it, if it is the same."""
+    """What is in the photos; with the shape that the camera file has for it, if it is the same, or the same turned."""
 
     max_error: Annotated[
         float | None, tyro.conf.arg(metavar="PX", help_behavior_hint="(default: twice the held-out error of the file)")
@@ -75,8 +71,9 @@ def main(words: Sequence[str]) -> int:
     _check_options(options)
 
     from calib.board_turns import board_turns
-    from calib.check import check_camera
+    from calib.check import check_camera, known_shape
     from calib.cli.calibrating import see_board
+    from calib.cli.check_limits import limit_of, shapes_to_try
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
@@ -85,7 +82,8 @@ def main(words: Sequence[str]) -> int:
     from sfm.io.atomic import write_text
 
     original, record = _read(options.camera)
-    board = board_of(options.board) if options.board else _board_of_file(options.camera, record)
+    known = _known_board(options, record)
+    board = board_of(options.board) if options.board else known
     observer, size = told(), pixel_size(options.size) if options.size else None
     with kernels_announced(observer):
         seen = see_board(
@@ -94,15 +92,22 @@ def main(words: Sequence[str]) -> int:
         )  # fmt: skip
         finding = shown_size(seen, options.images)
         camera, sigmas = _at_size(original, record, seen)
-        limit = options.max_error or _limit(record)
         turns = board_turns(seen.board) if seen.board is not None else ()
-        checked = check_camera(
-            camera, _shape(record, seen), seen.views, limit_px=limit, sigmas=sigmas,
-            stated_px=record.number("rms_px") * camera.width / original.width,
-            is_ours=record.facts.get("kind") == "photos", turns=turns,
-        )  # fmt: skip
-    if isinstance(checked, Rejected):
-        raise no_check(seen, checked, options.images)
+        shapes = shapes_to_try(record, known, seen)
+        limit = limit_of(record, options.max_error, with_shape=bool(shapes))
+        tried = [
+            check_camera(
+                camera, shape, seen.views, limit_px=limit.px, sigmas=sigmas,
+                stated_px=record.number("rms_px") * camera.width / original.width,
+                is_ours=record.facts.get("kind") == "photos", turns=turns,
+            )
+            for shape in (shapes or [known_shape(seen.points3D)])
+        ]  # fmt: skip
+    able = [one for one in tried if not isinstance(one, Rejected)]
+    if not able:
+        assert isinstance(tried[0], Rejected)
+        raise no_check(seen, tried[0], options.images)
+    checked = min(able, key=lambda one: one.rms_px)
     if finding is not None:
         checked = dataclasses.replace(checked, findings=(finding, *checked.findings))
     factor = camera.width / original.width
@@ -111,9 +116,9 @@ def main(words: Sequence[str]) -> int:
         points = checked.found.observations.points2D
         write_text(options.suggest, suggestions_svg(camera, seen.board, points, None, suggested))
     if options.json:
-        print(json.dumps(check_json(checked, seen, record, suggested), indent=2, ensure_ascii=False))
+        print(json.dumps(check_json(checked, seen, record, suggested, limit.why), indent=2, ensure_ascii=False))
     else:
-        print("\n".join(check_lines(checked, seen, record, suggested)))
+        print("\n".join(check_lines(checked, seen, record, suggested, limit.why)))
     return ExitCode.QUALITY_GATE_FAILED if checked.failed else ExitCode.OK
 
 
@@ -126,6 +131,9 @@ def _check_options(options: CheckOptions) -> None:
         raise ConfigError(f"--max-error must be positive, got {options.max_error:g}")
     if options.suggest and options.suggest.suffix.lower() != ".svg":
         raise ConfigError(f"--suggest must end in .svg, got {options.suggest}")
+    from sfm.io.atomic import check_writable
+
+    check_writable(options.suggest)
 
 
 def _read(path: Path) -> tuple[Camera, CameraRecord]:
@@ -143,15 +151,16 @@ def _read(path: Path) -> tuple[Camera, CameraRecord]:
     return next(iter(cameras.values())), CameraRecord(facts)
 
 
-def _board_of_file(path: Path, record: CameraRecord) -> Board | None:
-    from calib.boards_text import parse_board
+def _known_board(options: CheckOptions, record: CameraRecord) -> Board | None:
+    """The board of the file; one that is only a description does not matter where another is named."""
+    from calib.cli.check_limits import board_of_record
 
-    if record.board is None:
-        return None
     try:
-        return parse_board(record.board.spec)
-    except ConfigError as error:
-        raise ConfigError(f"[board] {error.cause}", path=path, remedy="name the board with --board") from error
+        return board_of_record(options.camera, record)
+    except ConfigError:
+        if not options.board:
+            raise
+        return None
 
 
 def _at_size(camera: Camera, record: CameraRecord, seen: Sightings) -> tuple[Camera, dict[str, float]]:
@@ -172,19 +181,3 @@ def _at_size(camera: Camera, record: CameraRecord, seen: Sightings) -> tuple[Cam
     if abs(width * camera.height - height * camera.width) > max(camera.width, camera.height):
         return camera, sigmas
     return resized(camera, sigmas, width, height)
-
-
-def _limit(record: CameraRecord) -> float:
-    held_out = record.number("holdout_rms_px")
-    known = held_out if held_out == held_out else record.number("rms_px")
-    return _TOLERANCE * known if known == known else _UNKNOWN_PX
-
-
-def _shape(record: CameraRecord, seen: Sightings) -> BoardShape:
-    """Where the corners lie: as estimated when the camera was calibrated, if it is the same board."""
-    from calib.check import known_shape
-
-    board, spec = record.board, seen.board.spec if seen.board is not None else None
-    if board is not None and board.spec == spec and board.displacements.shape == seen.points3D.shape:
-        return known_shape(seen.points3D + board.displacements)
-    return known_shape(seen.points3D)

@@ -19,7 +19,7 @@ _MANY = 12
 
 
 def check_json(
-    check: CameraCheck, seen: Sightings, record: CameraRecord, suggested: Sequence[SuggestedView]
+    check: CameraCheck, seen: Sightings, record: CameraRecord, suggested: Sequence[SuggestedView], limit_from: str
 ) -> dict[str, Any]:
     """Everything, as plain values; what is not known is null."""
     rms, counts = check.found.view_rms_px, np.diff(check.found.observations.offsets)
@@ -27,6 +27,7 @@ def check_json(
         "verdict": "failed" if check.failed else "passed",
         "rms_px": check.rms_px,
         "limit_px": check.limit_px,
+        "limit_from": limit_from,
         "calibration": {
             "rms_px": _finite(record.number("rms_px")),
             "holdout_rms_px": _finite(record.number("holdout_rms_px")),
@@ -47,12 +48,13 @@ def check_json(
 
 
 def check_lines(
-    check: CameraCheck, seen: Sightings, record: CameraRecord, suggested: Sequence[SuggestedView]
+    check: CameraCheck, seen: Sightings, record: CameraRecord, suggested: Sequence[SuggestedView], limit_from: str
 ) -> Iterator[str]:
     """Verdict, errors, what has changed, what is wrong, what would help."""
     camera = check.found.camera
     grave = ", ".join(finding.cause for finding in check.findings if finding.cause in GRAVE)
     yield f"{f'FAILED: {grave};' if grave else 'passed:'} error {check.rms_px:.4f} px, {check.limit_px:.4f} px allowed"
+    yield f"allowed is {limit_from}"
     kind = "photos" if seen.kind == "photos" else "views"
     yield (
         f"{len(check.found.observations)} of {seen.count} {kind} of {camera.width} × {camera.height} px, "

@@ -44,10 +44,10 @@ class DetectOptions:
     tag, gap), circles:8x10:25mm:15mm (circles, distance, diameter), acircles:4x11:20mm (rows half as far)."""
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE", help_behavior_hint="")] = None
-    """Writes all corners with their covariances as JSON; pixels as in COLMAP, the centre of the first is (0.5, 0.5)."""
+    """Writes all corners with their covariances, .json; pixels as in COLMAP, the centre of the first is (0.5, 0.5)."""
 
     overlays: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None
-    """Writes the photos with what was found drawn into them, as PNG."""
+    """Writes the photos with what was found drawn into them, as PNG, to a folder that does not hold photos."""
 
     json: Flag = False
     """The summary of each photo as JSON."""
@@ -66,9 +66,15 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"--threads must not be negative, got {options.threads}")
     if not options.images:
         raise ConfigError("no photos are named", remedy="name a folder of photos")
+    if options.output and options.output.suffix.lower() != ".json":
+        raise ConfigError(f"-o must end in .json, got {options.output}")
     board = board_of(options.board)
-    from calib.cli.photos import detect_photos, detection_cache, find_photos
+    from calib.cli.photos import check_apart, detect_photos, detection_cache, find_photos
+    from sfm.io.atomic import check_writable
 
+    if options.overlays:
+        check_apart(options.overlays, options.images)
+    check_writable(options.output, options.overlays and options.overlays / "overlay.png")
     photos = find_photos(options.images)
     cache = None if options.no_cache else detection_cache()
     seen = detect_photos(photos, board, threads=options.threads, cache=cache, observer=_told())

@@ -91,9 +91,10 @@ def main(words: Sequence[str]) -> int:
     from calib.cli.refusals import no_board
     from calib.cli.robot_poses import poses_of_photos, read_robot_poses
     from calib.hand_eye import HandEyeConfig, calibrate_hand_eye
-    from sfm.io.atomic import write_text
+    from sfm.io.atomic import check_writable, write_text
     from sfm.io.camera_files import read_intrinsics
 
+    check_writable(options.output)
     table = read_robot_poses(options.poses, _UNITS[options.unit])
     cameras = read_intrinsics(options.camera)
     if len(cameras) != 1:

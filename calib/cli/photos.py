@@ -22,7 +22,7 @@ import calib
 from calib.boards import Board
 from calib.detect import DetectConfig, Detection, detect_board
 from sfm.core.arrays import ImageU8
-from sfm.core.errors import ImageError, InputError, Rejected
+from sfm.core.errors import ConfigError, ImageError, InputError, Rejected
 from sfm.core.events import SILENT, ImageRead, Observer, StageFinished, StageStarted
 from sfm.core.execution import available_threads, ordered_map
 from sfm.io.atomic import write_text
@@ -50,6 +50,14 @@ def find_photos(sources: Sequence[Path]) -> dict[str, Path]:
     if not photos:
         raise InputError("holds no image", path=sources[0] if sources else None)
     return photos
+
+
+def check_apart(folder: Path, sources: Sequence[Path]) -> None:
+    """Raises ConfigError where images written to a folder would be taken for photos the next time."""
+    folders = {(source if source.is_dir() else source.parent).resolve() for source in sources}
+    if folders & {folder.resolve(), *folder.resolve().parents}:
+        cause = "lies among the photos, and the next run would take what is written there for photos"
+        raise ConfigError(cause, path=folder, remedy="name a folder elsewhere")
 
 
 def photos_of(sources: Sequence[Path], names: Sequence[str], *, gray: bool = False) -> dict[str, ImageU8]:
@@ -92,7 +100,7 @@ def detect_photos(
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        found = ordered_map(seen, photos.items(), threads=threads or available_threads())
+        found = ordered_map(seen, photos.items(), threads=threads or available_threads(), abandons=True)
         for name, detection in zip(photos, found, strict=True):
             result[name] = detection
             observer(ImageRead(name=name, reason="" if detection else detection.reason))

@@ -58,9 +58,10 @@ def main(words: Sequence[str]) -> int:
     if options.range is not None and not options.range > 0:
         raise ConfigError(f"--range must be positive, got {options.range:g}")
 
-    from sfm.io.atomic import write_text
+    from sfm.io.atomic import check_writable, write_text
     from sfm.io.rig_files import is_rig_file
 
+    check_writable(options.output)
     if not is_rig_file(options.camera):
         page = _page_of_camera(options)
     elif options.range is not None:

@@ -13,6 +13,7 @@ from calib.cli.calibrating import CalibratedCamera
 from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
 from calib.diagnose import Finding
 from calib.refine import Calibration
+from calib.uncertainty import rms_uncertainty
 from sfm.core.arrays import ImageU8
 from sfm.core.errors import Rejected
 
@@ -80,10 +81,16 @@ def _quality(result: CalibratedCamera) -> str:
     ]
     for words, given in (
         ("error on photos that were held out", held),
-        ("difference between the cameras of two halves of the photos", halves),
+        ("difference between the cameras of two halves of the photos (median of several halvings)", halves),
     ):
         known = f"not known: {given.detail or given.reason}" if isinstance(given, Rejected) else in_px(given.rms_px)
         rows.append((words, known))
+    for words, covariances in (
+        ("uncertainty of a pixel far away, over the image, by photos (σ)", result.by_view),
+        ("the same, were all corners independent: a lower bound", result.covariances),
+    ):
+        refused = isinstance(covariances, Rejected)
+        rows.append((words, "not known" if refused else in_px(rms_uncertainty(found, covariances))))
     rows.append(("converged", "yes" if found.converged else "no"))
     return table([], [[label, value] for label, value in rows])
 
@@ -117,14 +124,14 @@ def _ranked(result: CalibratedCamera) -> Iterator[str]:
         ])  # fmt: skip
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
-        yield table(["", "training", "held out", "uncertainty of the camera", ""], [
+        yield table(["", "training", "held out", "uncertainty of the camera, at least", ""], [
             [shape.kind, in_px(shape.rms_px), in_px(shape.held.rms_px if shape.held else np.nan),
-             in_px(shape.camera_sigma_px), shape.refused] for shape in result.shapes
+             in_px(shape.camera_bound_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
 
 
 def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
-    given = result.covariances if isinstance(result.by_view, Rejected) else result.by_view
+    given = result.doubts
     if isinstance(given, Rejected):
         return f"<p>Not known: {escape(given.detail or given.reason)}.</p>"
     found = result.found

@@ -106,6 +106,9 @@ def checked(options: CommonOptions, sources: Mapping[str, str]) -> tuple[Board, 
     for option, value, known in (("shape", options.shape, (AUTO, *SHAPES)), ("pair", options.pair, PAIRINGS)):
         if value not in known:
             raise ConfigError(f"unknown --{option} {value!r}", remedy=f"known are {', '.join(known)}")
+    from sfm.io.atomic import check_writable
+
+    check_writable(options.output)
     lenses_of(options, tuple(sources))
     files = {name: expanded(source) for name, source in sources.items()}
     known_cameras(options, tuple(sources))

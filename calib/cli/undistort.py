@@ -25,6 +25,10 @@ EXAMPLES = (
 )
 
 
+_LARGEST = 4e8
+"""Pixels: where each of them comes from takes 16 bytes, and some more on the way."""
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class UndistortOptions:
     """Writes photos without their lens distortion, and the pinhole camera that they now have, camera.toml, beside them.
@@ -80,13 +84,14 @@ def main(words: Sequence[str]) -> int:
     from calib.cli.photos import find_photos
     from sfm.core.cameras.undistortion import undistortion_grid
     from sfm.core.execution import available_threads, ordered_map
-    from sfm.io.atomic import write_bytes
+    from sfm.io.atomic import check_writable, write_bytes
     from sfm.io.camera_files import write_camera_toml
     from sfm.io.image_encoding import encoded_image
 
     camera, photos = _camera(options.camera), find_photos(options.images)
     if any(path.resolve() == (options.output / name).resolve() for name, path in photos.items()):
         raise ConfigError("would write over the photos", path=options.output, remedy="choose another -o")
+    check_writable(options.output / "camera.toml")
     target = _target(camera, options)
     map_x, map_y = undistortion_grid(camera, target)
     valid = (map_x >= 0) & (map_x <= camera.width) & (map_y >= 0) & (map_y <= camera.height)
@@ -147,6 +152,11 @@ def _target(camera: Camera, options: UndistortOptions) -> Camera:
     seen = 2 * math.degrees(_widest_angle(camera))
     if seen > options.max_fov:
         print(f"the lens sees up to {seen:.0f}°, of which a pinhole of at most {options.max_fov:.0f}° across is made")
+    if not target.width * options.scale * target.height * options.scale <= _LARGEST:
+        size = " × ".join(f"{side * options.scale:.0f}" for side in (target.width, target.height))
+        raise ConfigError(
+            f"the result would have {size} px, more than {_LARGEST:.0e}", remedy="choose a smaller --scale"
+        )
     width, height = (max(1, round(side * options.scale)) for side in (target.width, target.height))
     target = target.scaled(width, height)
     if options.crop != "valid":

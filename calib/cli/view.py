@@ -57,9 +57,11 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError("no photos are named", remedy="name the folder of photos after the camera file")
 
     from calib.cli.progress import told
+    from sfm.io.atomic import check_writable
     from sfm.io.rig_files import is_rig_file
     from sfm.viz.rerun_boards import log_boards
 
+    check_writable(options.save)
     scene, files = (_rig if is_rig_file(options.camera) else _camera)(options, told())
 
     def photo(camera: str, name: str) -> ImageU8:

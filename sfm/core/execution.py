@@ -9,6 +9,7 @@ from __future__ import annotations
 import collections
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -16,6 +17,7 @@ from typing import TypeVar, cast
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+_ABANDONABLE = "abandonable"
 
 
 def available_threads() -> int:
@@ -32,18 +34,24 @@ def machine_bytes() -> int:
 
 
 def ordered_map(
-    function: Callable[[Item], Result], items: Iterable[Item], *, threads: int = 1, ahead: int = 2
-) -> Iterator[Result]:
+    function: Callable[[Item], Result], items: Iterable[Item], *, threads: int = 1, ahead: int = 2,
+    abandons: bool = False,
+) -> Iterator[Result]:  # fmt: skip
     """`map(function, items)` on `threads` threads, yielded in the order of the items.
 
     Items are drawn lazily, at most `threads + ahead` of them in flight, so that memory stays bounded.
     An exception of `function` is raised where its result would have been yielded.
+
+    Args:
+        abandons: an interruption by the user does not wait for items in flight, which may take seconds and must leave
+            nothing broken whenever they are cut off; see `has_abandoned`.
     """
     if threads <= 1:
         yield from map(function, items)
         return
     pending: collections.deque[Future[Result]] = collections.deque()
-    pool = ThreadPoolExecutor(threads)
+    pool = ThreadPoolExecutor(threads, thread_name_prefix=_ABANDONABLE if abandons else "")
+    waits = True
     try:
         for item in items:
             pending.append(pool.submit(function, item))
@@ -51,8 +59,16 @@ def ordered_map(
                 yield pending.popleft().result()
         while pending:
             yield pending.popleft().result()
+    except KeyboardInterrupt:
+        waits = not abandons
+        raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=waits, cancel_futures=True)
+
+
+def has_abandoned() -> bool:
+    """Whether items that nobody waits for are still at work; Python itself would wait for them before it ends."""
+    return any(thread.name.startswith(_ABANDONABLE) for thread in threading.enumerate())
 
 
 class Workers:

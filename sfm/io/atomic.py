@@ -7,6 +7,7 @@ do in one step. A reader, or a run that was killed and starts again, never meets
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import secrets
 import shutil
@@ -42,6 +43,27 @@ def _remedy(error: OSError) -> str:
         case FileExistsError() | NotADirectoryError() | IsADirectoryError():
             return "choose another path, or move what lies there"
     return "choose another disk or folder"
+
+
+def check_writable(*targets: Path | None) -> None:
+    """Finds out before long work whether files can be written where they are wanted; leaves nothing behind.
+
+    Raises:
+        InputError: the system refuses, or a folder has the name of a file.
+    """
+    for target in targets:
+        if target is None:
+            continue
+        with os_errors(target):
+            if target.is_dir():
+                raise IsADirectoryError(errno.EISDIR, "is a folder")
+            folder = next(parent for parent in Path(os.path.abspath(target)).parents if parent.exists())
+            probe = folder / f".{secrets.token_hex(4)}.tmp"
+            try:
+                probe.touch(exist_ok=False)
+            finally:
+                with contextlib.suppress(OSError):
+                    probe.unlink()
 
 
 @contextlib.contextmanager

@@ -67,8 +67,8 @@ def read_camera_set(path: Path | str, size: tuple[int, int] | None = None) -> tu
         size: of the images where the file does not say.
     Raises:
         InputError: the file cannot be opened.
-        FormatError: it is not what its suffix promises, of no known program, or has no equal among our models.
-        ConfigError: a key of a `.toml` is unknown, missing or out of its range.
+        FormatError: it is not what its suffix promises, of no known program, or has no equal among our models; a key of
+            a `.toml` is unknown, missing or out of its range.
     """
     path = Path(path)
     if path.suffix.lower() in FOREIGN_SUFFIXES:

@@ -18,12 +18,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
 from sfm.core.cameras import Camera
-from sfm.core.errors import ConfigError, FormatError
+from sfm.core.errors import FormatError
 from sfm.io import colmap_binary, colmap_text
 from sfm.io.atomic import write_text
+from sfm.io.camera_bounds import out_of_bounds
 from sfm.io.camera_foreign import FOREIGN_SUFFIXES, read_foreign_cameras
 from sfm.io.camera_records import TABLES, CameraRecord, record_from_document, record_lines
 from sfm.io.camera_tables import camera_from_table, check_keys, toml_document
@@ -37,8 +36,8 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
 
     Raises:
         InputError: the file cannot be opened.
-        FormatError: it is not what its suffix promises, or holds no camera.
-        ConfigError: a key of the camera file is unknown, missing or out of its range.
+        FormatError: it is not what its suffix promises, or holds no camera, or one that cannot be; a key of the camera
+            file is unknown, missing or out of its range.
     """
     path = Path(path)
     match path.suffix.lower():
@@ -55,8 +54,8 @@ def read_intrinsics(path: Path | str) -> dict[int, Camera]:
     if not cameras:
         raise FormatError("holds no camera", path=path)
     for camera_id, camera in cameras.items():
-        if min(camera.width, camera.height) <= 0 or not np.isfinite(camera.params).all():
-            raise FormatError(f"camera {camera_id} has no size, or a parameter that is not finite", path=path)
+        if why := out_of_bounds(camera.model_info, camera.width, camera.height, camera.params):
+            raise FormatError(f"camera {camera_id}: {why}", path=path)
     return {
         camera_id: Camera(camera.model, camera.width, camera.height, camera.params, has_prior_focal_length=True)
         for camera_id, camera in cameras.items()
@@ -104,17 +103,16 @@ def read_camera_file(path: Path | str) -> tuple[Camera, CameraRecord]:
 
     Raises:
         InputError: the file cannot be opened.
-        FormatError: it is no TOML.
-        ConfigError: a table or key is unknown, missing or out of its range.
+        FormatError: it is no TOML, or a table or key is unknown, missing or out of its range.
     """
     path = Path(path)
     document = toml_document(path)
     if "rig" in document:
         remedy = f"take one out: calib convert {path} -o camera.toml --camera NAME"
-        raise ConfigError("is the file of a rig, one camera is needed", path=path, remedy=remedy)
+        raise FormatError("is the file of a rig, one camera is needed", path=path, remedy=remedy)
     check_keys(document, ("camera", *TABLES), path)
     table = document.get("camera")
     if not isinstance(table, dict):
-        raise ConfigError("has no table [camera]", path=path)
+        raise FormatError("has no table [camera]", path=path)
     camera = camera_from_table(table, path)
     return camera, record_from_document(document, camera.model_info, path)

@@ -78,14 +78,20 @@ def _camera(values: Mapping[str, Any]) -> Camera:
             raise ValueError(f"{key} must be a number, got {value!r}")
         return float(value)
 
+    def by_angle(key: str, side: int) -> float:
+        angle = number(key)
+        if not 0 < angle < math.pi:
+            raise ValueError(f"{key} must be an angle between 0 and pi, got {angle:g}")
+        return side / 2 / math.tan(angle / 2)
+
     width, height = integer(values.get("w"), "w"), integer(values.get("h"), "h")
     if "fl_x" in values:
         fx = number("fl_x")
     elif "camera_angle_x" in values:
-        fx = width / 2 / math.tan(number("camera_angle_x") / 2)
+        fx = by_angle("camera_angle_x", width)
     else:
         raise ValueError("has neither fl_x nor camera_angle_x")
-    usual = height / 2 / math.tan(number("camera_angle_y") / 2) if "camera_angle_y" in values else fx
+    usual = by_angle("camera_angle_y", height) if "camera_angle_y" in values else fx
     fy = number("fl_y", usual)
     head = [fx, fy, number("cx", width / 2), number("cy", height / 2)]
     model = str(values.get("camera_model") or ("OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))

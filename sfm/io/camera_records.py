@@ -13,7 +13,9 @@ corners = 756
 rms_px = 0.1679                   # root of the mean squared length of residuals
 sigma_px = 0.1262                 # of one coordinate
 holdout_rms_px = 0.1735           # as rms_px, of views that were held out
+holdout_flat_px = 0.1735          # the same with the board taken for flat
 split_half_px = 0.9               # difference of the cameras of two halves of the views, over the image
+uncertainty_px = 0.4              # standard deviation of a pixel far away, over the image, by views if they are enough
 converged = true
 would_bring = "a free board shape would bring …"   # what was not taken though it predicts photos better
 
@@ -49,13 +51,13 @@ from jaxtyping import Float64
 
 from sfm.core.arrays import Points3D, Value, Vector, readonly
 from sfm.core.cameras import CameraModel
-from sfm.core.errors import ConfigError
+from sfm.core.errors import FormatError
 
 Fact: TypeAlias = str | int | float | bool
 _FACTS: dict[type, tuple[str, ...]] = {
     str: ("command", "date", "version", "lens", "kind", "photos_digest", "would_bring"),
     int: ("photos", "views", "corners"),
-    float: ("rms_px", "sigma_px", "holdout_rms_px", "split_half_px"),
+    float: ("rms_px", "sigma_px", "holdout_rms_px", "holdout_flat_px", "split_half_px", "uncertainty_px"),
     bool: ("converged",),
 }
 FACTS: Mapping[str, type] = MappingProxyType({key: kind for kind, keys in _FACTS.items() for key in keys})
@@ -123,18 +125,18 @@ def record_from_document(document: Mapping[str, Any], model: CameraModel, path: 
         model: of the camera in the file.
         path: of the file, for errors.
     Raises:
-        ConfigError: a key is unknown, missing, or out of its range.
+        FormatError: a key is unknown, missing, or out of its range.
     """
     facts = _table(document, "calibration", path)
     for key, value in facts.items():
         kind = FACTS.get(key)
         if kind is None:
-            raise ConfigError(f"[calibration] unknown key {key!r}; known are {', '.join(FACTS)}", path=path)
+            raise FormatError(f"[calibration] unknown key {key!r}; known are {', '.join(FACTS)}", path=path)
         if type(value) is not kind and not (kind is float and type(value) is int):
-            raise ConfigError(f"[calibration] {key} must be {kind.__name__}, got {value!r}", path=path)
+            raise FormatError(f"[calibration] {key} must be {kind.__name__}, got {value!r}", path=path)
     findings = document.get("finding", [])
     if not isinstance(findings, list):
-        raise ConfigError("findings are tables [[finding]]", path=path)
+        raise FormatError("findings are tables [[finding]]", path=path)
     return CameraRecord(
         facts,
         _uncertainty(_table(document, "uncertainty", path), model, path),
@@ -176,7 +178,7 @@ def _written(value: Fact | list[Any]) -> str:
 def _table(document: Mapping[str, Any], name: str, path: Path) -> dict[str, Any]:
     table = document.get(name, {})
     if not isinstance(table, dict):
-        raise ConfigError(f"[{name}] must be a table", path=path)
+        raise FormatError(f"[{name}] must be a table", path=path)
     return table
 
 
@@ -187,12 +189,12 @@ def _uncertainty(table: dict[str, Any], model: CameraModel, path: Path) -> Param
     free = table.get("free")
     if not isinstance(free, list) or free != [name for name in model.param_names if name in free]:
         names = ", ".join(model.param_names)
-        raise ConfigError(f"[uncertainty] free must name parameters of {model.name} in order: {names}", path=path)
+        raise FormatError(f"[uncertainty] free must name parameters of {model.name} in order: {names}", path=path)
     covariance = _numbers(table.get("covariance"), (len(free), len(free)), "[uncertainty] covariance", path)
     if np.any(np.diag(covariance) < 0) or np.abs(covariance - covariance.T).max(initial=0.0) > _ASYMMETRY * np.abs(
         covariance
     ).max(initial=0.0):
-        raise ConfigError("[uncertainty] covariance must be symmetric, with no negative variance", path=path)
+        raise FormatError("[uncertainty] covariance must be symmetric, with no negative variance", path=path)
     for key in ("sigma", "sigma_by_view"):
         if key in table:
             _numbers(table[key], (len(free),), f"[uncertainty] {key}", path)
@@ -206,7 +208,7 @@ def _board(table: dict[str, Any], path: Path) -> BoardRecord | None:
     _known(table, ("spec", "shape", "displacements"), "[board]", path)
     for key in ("spec", "shape"):
         if not isinstance(table.get(key), str):
-            raise ConfigError(f"[board] needs {key} (text), got {table.get(key)!r}", path=path)
+            raise FormatError(f"[board] needs {key} (text), got {table.get(key)!r}", path=path)
     moved = table.get("displacements", [])
     count = len(moved) if isinstance(moved, list) else 0
     return BoardRecord(table["spec"], table["shape"], _numbers(moved, (count, 3), "[board] displacements", path))
@@ -215,7 +217,7 @@ def _board(table: dict[str, Any], path: Path) -> BoardRecord | None:
 def _finding(table: Any, path: Path) -> tuple[str, str, str]:
     keys = ("cause", "detail", "remedy")
     if not isinstance(table, dict) or not all(isinstance(table.get(key), str) for key in keys):
-        raise ConfigError("[[finding]] needs cause, detail and remedy (text)", path=path)
+        raise FormatError("[[finding]] needs cause, detail and remedy (text)", path=path)
     _known(table, keys, "[[finding]]", path)
     return table["cause"], table["detail"], table["remedy"]
 
@@ -226,11 +228,11 @@ def _numbers(values: Any, shape: tuple[int, ...], what: str, path: Path) -> np.n
         if np.shape(values) not in (shape, (0,)) or not np.isfinite(array).all():
             raise ValueError
     except (ValueError, TypeError) as error:
-        raise ConfigError(f"{what} must be {' × '.join(map(str, shape))} finite numbers", path=path) from error
+        raise FormatError(f"{what} must be {' × '.join(map(str, shape))} finite numbers", path=path) from error
     return array
 
 
 def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str, path: Path) -> None:
     unknown = sorted(set(table) - set(keys))
     if unknown:
-        raise ConfigError(f"{where} unknown key {unknown[0]!r}; known are {', '.join(keys)}", path=path)
+        raise FormatError(f"{where} unknown key {unknown[0]!r}; known are {', '.join(keys)}", path=path)

@@ -15,6 +15,7 @@ from sfm.core.cameras.conversion import converted
 from sfm.core.errors import FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
+from sfm.io.camera_bounds import out_of_bounds
 
 _ROTATION_TOLERANCE = 1e-3
 """Of RᵀR − 1: files have few digits; what is farther off is no rotation."""
@@ -48,15 +49,11 @@ def camera_of(model: str, width: int, height: int, params: Sequence[float], *, p
     """A camera whose principal point is as a program counts that has the first pixel's centre at `pixel_center`.
 
     Raises:
-        ValueError: a number is not finite, or the focal length or the size is not positive.
+        ValueError: a number is not finite, or focal length, size or centre are none that a camera has.
     """
     info, values = model_by_name(model), np.array(params, np.float64)
-    if not np.isfinite(values).all():
-        raise ValueError("a parameter is not finite")
-    if width <= 0 or height <= 0:
-        raise ValueError(f"the image size is {width} x {height}")
-    if min(values[list(info.focal_indices)], default=1.0) <= 0:
-        raise ValueError(f"the focal lengths are {values[list(info.focal_indices)].tolist()}")
+    if why := out_of_bounds(info, width, height, values):
+        raise ValueError(why)
     values[list(info.principal_point_indices)] += 0.5 - pixel_center
     return Camera(model, width, height, values, has_prior_focal_length=True)
 

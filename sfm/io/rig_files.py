@@ -37,7 +37,7 @@ from jaxtyping import Float64
 
 from sfm.core.arrays import Value, Vector, readonly
 from sfm.core.cameras import Camera
-from sfm.core.errors import ConfigError
+from sfm.core.errors import FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 from sfm.core.scene import CameraRig
@@ -105,15 +105,14 @@ def read_rig_file(path: Path | str) -> RigFile:
 
     Raises:
         InputError: the file cannot be opened.
-        FormatError: it is no TOML.
-        ConfigError: a table or key is unknown, missing or out of its range.
+        FormatError: it is no TOML, or a table or key is unknown, missing or out of its range.
     """
     path = Path(path)
     document = toml_document(path)
     _known(document, ("rig", "camera"), "", path)
     head, tables = document.get("rig"), document.get("camera")
     if not isinstance(head, dict) or not isinstance(tables, list) or not tables:
-        raise ConfigError("has no table [rig] or no [[camera]]", path=path)
+        raise FormatError("has no table [rig] or no [[camera]]", path=path)
     _known(head, ("reference", "unit", "rms_px", "provenance"), "[rig] ", path)
     cameras = tuple(_camera(table, path) for table in tables)
     try:
@@ -125,11 +124,11 @@ def read_rig_file(path: Path | str) -> RigFile:
             unit=_text(head, "unit", path),
         )
     except ValueError as error:
-        raise ConfigError(str(error), path=path) from error
+        raise FormatError(str(error), path=path) from error
     sigmas = tuple(_sigmas(table, camera, path) for table, camera in zip(tables, cameras, strict=True))
     rms = head.get("rms_px", math.nan)
     if type(rms) not in (int, float):
-        raise ConfigError(f"[rig] rms_px must be a number, got {rms!r}", path=path)
+        raise FormatError(f"[rig] rms_px must be a number, got {rms!r}", path=path)
     known = tuple(one for one in sigmas if one is not None)
     return RigFile(rig, float(rms), known if len(known) == len(sigmas) else (), _provenance(head, path))
 
@@ -172,7 +171,7 @@ def write_rig_file(path: Path | str, file: RigFile) -> None:
 
 def _camera(table: Any, path: Path) -> Camera:
     if not isinstance(table, dict) or not table.get("name"):
-        raise ConfigError("[[camera]] lacks a name", path=path)
+        raise FormatError("[[camera]] lacks a name", path=path)
     camera = camera_from_table(table, path, further=_FURTHER)
     return dataclasses.replace(camera, has_prior_focal_length=True)
 
@@ -180,7 +179,7 @@ def _camera(table: Any, path: Path) -> Camera:
 def _pose(table: Mapping[str, Any], path: Path) -> Rigid3:
     wxyz = _numbers(table, "rotation", 4, path)
     if not abs(np.linalg.norm(wxyz) - 1) < _NOT_UNIT:
-        raise ConfigError(f"rotation must be a unit quaternion w, x, y, z, got {wxyz.tolist()}", path=path)
+        raise FormatError(f"rotation must be a unit quaternion w, x, y, z, got {wxyz.tolist()}", path=path)
     return Rigid3(Rotation3(wxyz), _numbers(table, "translation", 3, path))
 
 
@@ -190,14 +189,14 @@ def _sigmas(table: Mapping[str, Any], camera: Camera, path: Path) -> MountedSigm
         return None
     values = [_numbers(table, key, count, path) for key, count in counts.items()]
     if min(part.min() for part in values) < 0:
-        raise ConfigError("standard deviations must not be negative", path=path)
+        raise FormatError("standard deviations must not be negative", path=path)
     return MountedSigmas(*values)
 
 
 def _provenance(head: Mapping[str, Any], path: Path) -> dict[str, Fact]:
     facts = head.get("provenance", {})
     if not isinstance(facts, dict) or any(not isinstance(fact, str | int | float) for fact in facts.values()):
-        raise ConfigError("[rig.provenance] must hold texts and numbers", path=path)
+        raise FormatError("[rig.provenance] must hold texts and numbers", path=path)
     return facts
 
 
@@ -205,20 +204,20 @@ def _numbers(table: Mapping[str, Any], key: str, count: int, path: Path) -> np.n
     values: Any = table.get(key)
     is_list = isinstance(values, list) and all(type(value) in (int, float) for value in values)
     if not is_list or len(values) != count or not np.isfinite(values).all():
-        raise ConfigError(f"[[camera]] {table['name']}: {key} must be {count} finite numbers, got {values}", path=path)
+        raise FormatError(f"[[camera]] {table['name']}: {key} must be {count} finite numbers, got {values}", path=path)
     return np.array(values, np.float64)
 
 
 def _text(head: Mapping[str, Any], key: str, path: Path) -> str:
     if not isinstance(head.get(key), str) or not head[key]:
-        raise ConfigError(f"[rig] needs {key} (text), got {head.get(key)!r}", path=path)
+        raise FormatError(f"[rig] needs {key} (text), got {head.get(key)!r}", path=path)
     return head[key]
 
 
 def _known(table: Mapping[str, Any], keys: tuple[str, ...], where: str, path: Path) -> None:
     unknown = sorted(set(table) - set(keys))
     if unknown:
-        raise ConfigError(f"{where}unknown key {unknown[0]!r}; known are {', '.join(keys)}", path=path)
+        raise FormatError(f"{where}unknown key {unknown[0]!r}; known are {', '.join(keys)}", path=path)
 
 
 def _key(name: str) -> str:

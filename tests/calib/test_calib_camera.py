@@ -272,7 +272,7 @@ def test_a_table_of_mrcal_is_read_with_its_holes(sfm, tmp_path, rng):
         (["camera", "bad.csv", "-o", "c.toml", "--size", "9x9"], 3, "is no table of corners"),
         (["camera", "bad.csv", "-o", "c.toml"], 2, "need --size"),
         (["check", "none.toml", "corners.json"], 3, "none.toml"),
-        (["check", "bad.toml", "corners.json"], 2, "[calibration] unknown key 'rsm_px'"),
+        (["check", "bad.toml", "corners.json"], 3, "[calibration] unknown key 'rsm_px'"),
     ],
 )
 def test_a_mistake_is_told_in_one_line(sfm, corners, tmp_path, words, code, said):

@@ -116,3 +116,14 @@ def test_views_go_through_flat_columns_and_back(rng):
     # The unit of weights is arbitrary; their ratios are not.
     ratio = again.roots[:, 0] / observations.roots[:, 0]
     np.testing.assert_allclose(again.roots, ratio[0] * observations.roots, rtol=1e-9, atol=1e-12)
+
+
+def test_several_halvings_are_told_by_their_median(rng):
+    found = calibrated(seen(LENS, BOARD, poses_before(LENS, 12, rng), rng))
+    chance = np.random.default_rng(3)
+    single = [split_half(BOARD, found, CONFIG, splits=1, rng=chance) for _ in range(5)]
+    several = split_half(BOARD, found, CONFIG, splits=5, rng=np.random.default_rng(3))
+    assert not isinstance(several, Rejected)
+    assert several.splits == 5
+    assert several.rms_px == np.median([one.rms_px for one in single])
+    assert several.worst_px == np.median([one.worst_px for one in single])

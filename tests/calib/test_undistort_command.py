@@ -178,3 +178,10 @@ def test_one_camera_of_a_rig_has_to_be_taken_out(scene: Path, capsys) -> None:
     write_rig_file(scene / "camera.toml", RigFile(CameraRig(("left", "right"), (BENT, BENT), poses, "left")))
     assert run(scene) == ExitCode.BAD_INPUT
     assert "--camera left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("scale", ["100", "inf"])
+def test_a_result_beyond_all_memory_is_refused_before_it_is_made(scene: Path, scale: str, capsys) -> None:
+    assert run(scene, "--scale", scale) == ExitCode.USAGE
+    assert "choose a smaller --scale" in capsys.readouterr().err
+    assert not (scene / "out" / "camera.toml").exists()

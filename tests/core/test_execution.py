@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm.core.execution import Workers, available_threads, chunk_bounds, ordered_map
+from sfm.core.execution import Workers, available_threads, chunk_bounds, has_abandoned, ordered_map
 
 
 @pytest.mark.parametrize("threads", [0, 1, 2, 5])
@@ -143,3 +143,32 @@ def test_threads_of_workers_end_with_them():
 def test_an_exception_of_a_worker_is_raised():
     with pytest.raises(ZeroDivisionError):
         Workers(2).map(lambda k: 1 / k, [1, 0])
+
+
+@pytest.mark.parametrize("abandons", [False, True])
+def test_an_interruption_waits_for_what_is_at_work_only_where_that_matters(abandons):
+    begun, go_on, done = threading.Event(), threading.Event(), []
+
+    def work(k):
+        if k == 0:
+            begun.set()
+            assert go_on.wait(30)
+            done.append(k)
+        if k == 1:
+            assert begun.wait(30)
+            if not abandons:
+                threading.Timer(0.2, go_on.set).start()
+            raise KeyboardInterrupt
+        return k
+
+    # The interruption comes by the second result, while the first item is at work.
+    results = ordered_map(work, [1, 0, *range(2, 50)], threads=2, abandons=abandons)
+    with pytest.raises(KeyboardInterrupt):
+        next(results)
+    assert has_abandoned() is abandons
+    assert done == ([] if abandons else [0])
+    go_on.set()
+    for thread in threading.enumerate():
+        if thread.name.startswith("abandonable"):
+            thread.join(30)
+    assert not has_abandoned()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sfm.core.errors import InputError
-from sfm.io.atomic import atomic_path, replace_folders, write_bytes, write_folder, write_text
+from sfm.io.atomic import atomic_path, check_writable, replace_folders, write_bytes, write_folder, write_text
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -105,3 +105,21 @@ def test_a_read_only_folder_is_an_input_error(tmp_path: Path) -> None:
                 write()
     finally:
         tmp_path.chmod(0o700)
+
+
+def test_where_files_can_be_written_nothing_is_left_of_the_question(tmp_path: Path) -> None:
+    (tmp_path / "there.txt").write_text("kept")
+    check_writable(tmp_path / "there.txt", None, tmp_path / "new" / "deeper" / "x.txt")
+    assert os.listdir(tmp_path) == ["there.txt"]
+    assert (tmp_path / "there.txt").read_text() == "kept"
+
+
+def test_where_files_cannot_be_written_that_is_known_before(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    for path, said in (("file/x.txt", "not a directory"), ("folder", "is a folder")):
+        with pytest.raises(InputError, match=said):
+            check_writable(tmp_path / path)
+    if os.path.isdir("/proc/self"):
+        with pytest.raises(InputError, match=r"/proc/x\.toml"):
+            check_writable(Path("/proc/x.toml"))

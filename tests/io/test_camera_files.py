@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from sfm.core.cameras import MODELS, Camera
-from sfm.core.errors import ConfigError, FormatError, InputError, SfmError
+from sfm.core.errors import FormatError, InputError, SfmError
 from sfm.io.camera_files import read_intrinsics, write_camera_toml
 
 GOOD = {
@@ -25,7 +25,9 @@ def toml(**changes: str | None) -> str:
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
 def test_a_camera_reads_back_to_the_last_bit(tmp_path: Path, rng: np.random.Generator, model) -> None:
-    camera = Camera(model.name, 4000, 3000, rng.normal(size=len(model.param_names)) * 10.0 ** rng.integers(-9, 9))
+    params = rng.normal(size=len(model.param_names)) * 10.0 ** rng.integers(-9, 7)
+    params[list(model.focal_indices)] = np.abs(params[list(model.focal_indices)])
+    camera = Camera(model.name, 4000, 3000, params)
     write_camera_toml(tmp_path / "c.toml", camera, name='left "ö" \\')
     (again,) = read_intrinsics(tmp_path / "c.toml").values()
     assert (again.model, again.width, again.height, again.has_prior_focal_length) == (model.name, 4000, 3000, True)
@@ -75,11 +77,17 @@ def test_colmaps_cameras_are_read(tmp_path: Path, suffix: str) -> None:
         (toml(pixel_center="0.25"), "pixel_center must be 0.5 or 0.0"),
         (toml(pixel_center='"half"'), "pixel_center must be 0.5 or 0.0"),
         (toml(name="3"), "name must be text"),
+        (toml(params="[-3200, 3200, 2000, 1500, 0, 0, 0, 0]"), "focal lengths are [-3200.0, 3200.0], which must be"),
+        (toml(params="[0, 0, 2000, 1500, 0, 0, 0, 0]"), "the focal lengths are [0.0, 0.0]"),
+        (toml(params="[1e299, 3200, 2000, 1500, 0, 0, 0, 0]"), "must be between 0 and 4e+07 px"),
+        (toml(params=f"[1{'0' * 400}, 3200, 2000, 1500, 0, 0, 0, 0]"), "params must be 8 finite"),
+        (toml(params="[3200, 3200, -1e9, 1500, 0, 0, 0, 0]"), "the principal point is [-1000000000.0, 1500.0]"),
+        (toml(width="4000000"), "the image size is 4000000 x 3000, more than 1000000 px"),
     ],
 )
-def test_a_mistake_in_a_camera_file_is_a_config_error_that_says_what(tmp_path: Path, text: str, cause: str) -> None:
+def test_a_mistake_in_a_camera_file_is_bad_input_that_says_what(tmp_path: Path, text: str, cause: str) -> None:
     (tmp_path / "c.toml").write_text(text)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(FormatError) as error:
         read_intrinsics(tmp_path / "c.toml")
     assert cause in str(error.value)
     assert "c.toml" in str(error.value)
@@ -94,6 +102,11 @@ def test_a_mistake_in_a_camera_file_is_a_config_error_that_says_what(tmp_path: P
         ("cameras.txt", b"1 PINHOLE 640 480 1\n", FormatError),
         ("cameras.txt", b"1 SIMPLE_PINHOLE 640 480 nan 1 1\n", FormatError),
         ("cameras.txt", b"1 SIMPLE_PINHOLE 640 0 500 1 1\n", FormatError),
+        ("cameras.txt", b"1 SIMPLE_PINHOLE 640 480 -500 1 1\n", FormatError),
+        ("cameras.txt", b"1 SIMPLE_PINHOLE 640 480 1e300 1 1\n", FormatError),
+        ("c.json", b'{"camera_angle_x": 0, "w": 640, "h": 480}', FormatError),
+        ("c.json", b'{"camera_angle_x": 1.0, "camera_angle_y": 7, "w": 640, "h": 480}', FormatError),
+        ("c.json", b'{"fl_x": 500, "w": 1e30, "h": 480}', FormatError),
         ("cameras.bin", b"\1", FormatError),
         ("cameras.bin", bytes(8), FormatError),
         ("calibration.yaml", b"", FormatError),

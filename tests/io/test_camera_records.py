@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm.core.cameras import Camera
-from sfm.core.errors import ConfigError
+from sfm.core.errors import FormatError
 from sfm.io.camera_files import read_camera_file, read_intrinsics, write_camera_toml
 from sfm.io.camera_records import BoardRecord, CameraRecord, ParameterCovariance
 
@@ -76,5 +76,5 @@ def test_a_file_without_a_record_has_an_empty_one(tmp_path):
 def test_a_wrong_table_is_named(tmp_path, tables, cause):
     body = f"{tables}\n{HEAD}" if not tables.startswith("[") else f"{HEAD}{tables}\n"
     (tmp_path / "c.toml").write_text(body)
-    with pytest.raises(ConfigError, match=cause.replace("[", r"\[")):
+    with pytest.raises(FormatError, match=cause.replace("[", r"\[")):
         read_camera_file(tmp_path / "c.toml")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sfm.core.cameras import Camera
-from sfm.core.errors import ConfigError, FormatError
+from sfm.core.errors import FormatError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import CameraRig
 from sfm.io.camera_files import camera_names, read_camera_file, read_intrinsics, write_camera_toml
@@ -72,7 +72,7 @@ def test_the_motion_between_two_cameras_composes() -> None:
 def test_a_mistake_in_a_rig_file_is_told(tmp_path: Path, old: str, new: str, cause: str) -> None:
     path = written(tmp_path, RigFile(RIG))
     path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(ConfigError, match=cause):
+    with pytest.raises(FormatError, match=cause):
         read_rig_file(path)
 
 
@@ -81,7 +81,7 @@ def test_what_is_no_rig_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="no TOML"):
         read_rig_file(tmp_path / "rig.toml")
     (tmp_path / "rig.toml").write_text("[rig]\nreference = 'a'\n")
-    with pytest.raises(ConfigError, match=r"no \[\[camera\]\]"):
+    with pytest.raises(FormatError, match=r"no \[\[camera\]\]"):
         read_rig_file(tmp_path / "rig.toml")
 
 
@@ -104,6 +104,6 @@ def test_a_rig_serves_as_intrinsics_with_the_names_of_its_cameras(tmp_path: Path
 
 
 def test_where_one_camera_is_needed_a_rig_says_how_to_take_one_out(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="is the file of a rig") as caught:
+    with pytest.raises(FormatError, match="is the file of a rig") as caught:
         read_camera_file(written(tmp_path, RigFile(RIG)))
     assert "--camera NAME" in str(caught.value)
