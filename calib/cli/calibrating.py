@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -26,6 +26,7 @@ from calib.diagnose_window import window_finding
 from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
 from calib.refine_board import ShapeKind
 from calib.refine_views import BoardView, gather
+from calib.turned_photos import turned_photos
 from calib.uncertainty import CalibrationCovariance, covariance
 from calib.uncertainty_holdout import (
     HeldOut,
@@ -47,6 +48,8 @@ STAGE = "calibration"
 AUTO = "auto"
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".jp2")
 Auto: TypeAlias = Literal["auto"]
+_NAMED = 12
+"""Photos that a finding names."""
 _WHILE_LENS_IS_CHOSEN: ShapeKind = "paraboloid"
 """Of all shapes it costs least where it is not needed, and takes most of a bend."""
 
@@ -255,9 +258,24 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
+        findings=(*_turned(seen, config), *_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view)),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
+    )
+
+
+def _turned(seen: Sightings, config: CalibrationConfig) -> Iterator[Finding]:
+    turned = turned_photos(seen.points3D, seen.views, config)
+    if turned is None:
+        return
+    named = ", ".join(turned.names[:_NAMED]) + (
+        f" and {len(turned.names) - _NAMED} more" if turned.names[_NAMED:] else ""
+    )
+    yield Finding(
+        "turned_photos",
+        f"{named}: turned by 180° in the file against the other photos; as they are the error is "
+        f"{turned.rms_px:.3f} px, with these turned back {turned.turned_back_rms_px:.3f} px",
+        "turn them back, or take the photos as the camera wrote them",
     )
 
 
