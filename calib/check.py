@@ -111,12 +111,20 @@ def check_camera(
     differences = (*_of_sizes(camera, left_out, len(views)), *_differences(check, lost, len(usable)))
     # Residuals of another camera are no longer white, whatever the board and the lens.
     of_photos = (f for f in diagnose_photos(found) if not (differences and f.cause in _BY_SHAPE))
-    windows = (
-        window_finding(found.observations, found.residuals),
-        stated_finding(stated_px, found.observations, found.residuals, is_ours=is_ours),
-    )
-    findings = (*filter(None, windows), *differences, *(f for f in of_photos if f.cause != "few_views"))
+    window = window_finding(found.observations, found.residuals)
+    stated = stated_finding(stated_px, found.observations, found.residuals, is_ours=is_ours)
+    if stated is not None:
+        differences = tuple(_perhaps_of_corners(finding) for finding in differences)
+    of_corners = (finding for finding in (window, stated) if finding is not None)
+    findings = (*of_corners, *differences, *(f for f in of_photos if f.cause != "few_views"))
     return dataclasses.replace(check, findings=findings)
+
+
+def _perhaps_of_corners(finding: Finding) -> Finding:
+    """A difference of a camera that was calibrated from worse corners."""
+    if finding.cause not in ("focal_length_differs", "principal_point_differs"):
+        return finding
+    return dataclasses.replace(finding, remedy=f"it may be those corners; if not, {finding.remedy}")
 
 
 def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:

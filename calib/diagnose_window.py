@@ -1,29 +1,31 @@
 """Whether corners were shifted by the squares next to theirs, because they were refined in too large a window.
 
-A refinement looks for the point that all edges in its window run towards. Edges of the next corners do not. On all
-sides of a corner they pull against one another; at the rim of the board there is nothing on the other side. So where
-the window reaches the next corners, those at the rim err by much more than those within; and where squares are larger
-than the window they do not. No lens, no bend of the board and no blur does both.
+A refinement looks for the point that all edges in its window run towards. Edges of the next squares do not. At the rim
+of a board, on the side that is tilted away, they pull from one side: where the window just reaches them, corners at the
+rim are off by pixels, and those within are not; where it reaches farther all are; and where squares are larger than the
+window none is. No lens, no bend of the board and no blur does that.
 
-    near, far     the third of all corners whose neighbours are nearest to them, in px, and that with the farthest
-    rim, within   corners with fewer than four neighbours in their photo, and the others
+    near, middle, far   thirds of all corners by the distance of the next one, px
+    rim, within         corners with fewer than four neighbours in their photo, and the others
 
 What was left out of a calibration belongs to it: these are the outliers.
 
 Reference:
-    docs.opencv.org, camera calibration tutorial: a window of 11 px to either side, which reaches the next corners
-    wherever squares are smaller than about 26 px.
+    docs.opencv.org, camera calibration tutorial: a window of 11 px to either side, which reaches the next squares
+    wherever corners are nearer than about 26 px.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 
 import numpy as np
 
 from calib.diagnose import Finding
 from calib.refine_views import Observations
-from sfm.core.arrays import FloatArray, Value, Vector
+from sfm.core.arrays import BoolArray, FloatArray, Value, Vector
 
 SHARE_OF_SPACING = 0.35
 """Half-window over the smallest spacing of corners that does not reach the next ones, seen obliquely."""
@@ -31,10 +33,10 @@ _USUAL_WINDOW_PX = 11.0
 """To either side: OpenCV's tutorial and most scripts."""
 _REACHED = 0.45
 """Of the spacing of corners, from where on a half-window begins to see the next ones."""
-_RIM, _NEAR = 1.7, 1.4
-"""Rms error at the rim over that within, and of near corners over far ones, that are told. With good corners of eleven
-sets the first is 1.5 at most where near ones are worse at all; a window of 11 px where it is too large gives 2.1 to 5,
-and 2.9 to 14."""
+_RIM, _NEAR = 1.7, 2.5
+"""Rms error of corners at the rim over those within, and of near ones at the rim over all far ones, that are told. With
+good corners of eleven sets where the first is more the second is 2.3 at most; with windows that are too large they are
+1.8 to 4.7 and 2.9 to 28."""
 _VISIBLE_PX = 0.1
 _FEWEST = 15
 """Corners of a kind that tell something."""
@@ -46,50 +48,51 @@ _ABOVE = 1.5
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Crowding(Value):
-    """Errors by how near the next corners are, rms in px; NaN where there are too few corners of a kind.
+    """Errors by how near the next corners are; NaN where there are too few corners of a kind.
 
     Attributes:
-        smallest_px: distance of two corners in the image.
-        near_px, far_px: below which, and beyond which, the next corner is near or far.
-        rim, within: of near corners.
-        near, far: of all.
+        smallest_px: least distance of two corners that are next to one another.
+        near_px, far_px: distances below which, and beyond which, the next corner is near or far.
+        rim, far: rms error of near corners at the rim, and of all far corners, px.
+        rim_over_within: ratio of rms errors, near or in the middle, whichever is larger.
     """
 
     smallest_px: float
     near_px: float
     far_px: float
     rim: float
-    within: float
-    near: float
     far: float
+    rim_over_within: float
 
     @property
     def is_shifted(self) -> bool:
-        """Whether the next corners shift near ones at the rim."""
-        return bool(self.rim > max(_RIM * self.within, _VISIBLE_PX) and self.near > _NEAR * self.far)
+        """Whether the next squares shift corners."""
+        return bool(self.rim > max(_NEAR * self.far, _VISIBLE_PX) and self.rim_over_within > _RIM)
 
 
 def crowding(observations: Observations, residuals: FloatArray) -> Crowding:
     """See the text of the module; residuals (n, 2) in px, projected − observed."""
-    spacings, is_within = _neighbours(observations)
-    known = np.isfinite(spacings)
-    near_px, far_px = np.quantile(spacings[known], [1 / 3, 2 / 3]) if known.any() else (np.nan, np.nan)
-    near, far = known & (spacings <= near_px), known & (spacings >= far_px)
     squares = np.sum(residuals**2, axis=1)
-    # A corner with no projection is as wrong as can be, but there is no telling by how much.
     seen = np.isfinite(squares)
+    spacings, is_within = _neighbours(observations, np.where(seen[:, None], residuals, 0.0))
+    seen &= np.isfinite(spacings)
+    if not seen.any():
+        return Crowding(*[math.nan] * 6)
+    near_px, far_px = (float(limit) for limit in np.quantile(spacings[seen], [1 / 3, 2 / 3]))
 
-    def rms(which: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(squares[which & seen]))) if np.sum(which & seen) >= _FEWEST else np.nan
+    def rms(which: BoolArray) -> float:
+        some = which & seen
+        return math.sqrt(float(np.mean(squares[some]))) if np.sum(some) >= _FEWEST else math.nan
 
+    near, far = spacings <= near_px, spacings >= far_px
+    ratios = [rms(third & ~is_within) / max(rms(third & is_within), 1e-9) for third in (near, ~near & ~far)]
     return Crowding(
-        smallest_px=float(spacings[known].min()) if known.any() else np.nan,
-        near_px=float(near_px),
-        far_px=float(far_px),
+        smallest_px=float(spacings[seen].min()),
+        near_px=near_px,
+        far_px=far_px,
         rim=rms(near & ~is_within),
-        within=rms(near & is_within),
-        near=rms(near),
         far=rms(far),
+        rim_over_within=max((ratio for ratio in ratios if math.isfinite(ratio)), default=math.nan),
     )
 
 
@@ -100,9 +103,10 @@ def window_finding(observations: Observations, residuals: FloatArray) -> Finding
         return None
     return Finding(
         "window_too_large",
-        f"where the next corner is nearest ({found.smallest_px:.0f} to {found.near_px:.0f} px), corners at the rim of "
-        f"the board err by {found.rim:.2f} px and those within by {found.within:.2f} px; where it is farther than "
-        f"{found.far_px:.0f} px all err by {found.far:.2f} px: the window of their refinement reached the next corners",
+        f"corners at the rim of the board err by {found.rim:.2f} px where the next corner is near "
+        f"({found.smallest_px:.0f} to {found.near_px:.0f} px), all by {found.far:.2f} px where it is farther than "
+        f"{found.far_px:.0f} px, and the rim by {found.rim_over_within:.1f} times as much as what lies within: the "
+        "window of their refinement reached the next squares",
         _remedy(found.smallest_px),
     )
 
@@ -121,14 +125,12 @@ def stated_finding(
     if not stated_px > max(_ABOVE * ours, ours + _VISIBLE_PX):
         return None
     smallest = crowding(observations, residuals).smallest_px
-    told = (
-        f"its own corners erred by {stated_px:.3f} px when it was calibrated; ours of these photos err by {ours:.3f} px"
-    )
+    told = f"its own corners erred by {stated_px:.3f} px when it was calibrated, ours of these photos by {ours:.3f} px"
     if not is_ours and _REACHED * smallest < _USUAL_WINDOW_PX:
         return Finding(
             "window_too_large",
             f"{told}: corners are {smallest:.0f} px apart, and the usual window of {_USUAL_WINDOW_PX:.0f} px to either "
-            "side reaches the next ones",
+            "side reaches the next squares",
             f"calibrate anew from photos; {_remedy(smallest)}",
         )
     return Finding("worse_corners", told, "calibrate anew, from photos as good as these")
@@ -142,18 +144,20 @@ def _remedy(smallest_px: float) -> str:
     )
 
 
-def _neighbours(observations: Observations) -> tuple[Vector, np.ndarray]:
-    """(n,) px to the nearest of the corners next to each on the board, inf without one; and whether it has four."""
+def _neighbours(observations: Observations, residuals: FloatArray) -> tuple[Vector, BoolArray]:
+    """(n,) px to the nearest of the corners next to each on the board, inf without one; and whether it has four.
+
+    Where corners should be is what counts: one that was shifted far may lie on the next.
+    """
     board = observations.board[:, :2]
     apart = np.linalg.norm(board[:, None] - board[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     is_next = apart <= _NEXT * apart.min(initial=np.inf)
     spacings, is_within = np.full(len(observations.rows), np.inf), np.zeros(len(observations.rows), bool)
-    for v in range(len(observations)):
-        rows = slice(observations.offsets[v], observations.offsets[v + 1])
-        pairs = is_next[np.ix_(observations.rows[rows], observations.rows[rows])]
-        points = observations.points2D[rows]
+    for start, end in itertools.pairwise(observations.offsets.tolist()):
+        pairs = is_next[np.ix_(observations.rows[start:end], observations.rows[start:end])]
+        points = observations.points2D[start:end] + residuals[start:end]
         lengths = np.where(pairs, np.linalg.norm(points[:, None] - points[None], axis=2), np.inf)
-        spacings[rows] = lengths.min(axis=1, initial=np.inf)
-        is_within[rows] = pairs.sum(axis=1) >= 4
+        spacings[start:end] = lengths.min(axis=1, initial=np.inf)
+        is_within[start:end] = pairs.sum(axis=1) >= 4
     return spacings, is_within

@@ -8,9 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib.refine_fit import Fit
+from calib.refine_lenses import Lens
 from calib.refine_system import RIDGE, CalibrationSystem
 from calib.zhang import largest_angle_between
 from sfm.core.arrays import FloatArray
+from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import Summary
 
@@ -37,25 +39,26 @@ def check_determined(fit: Fit, system: CalibrationSystem, summary: Summary) -> C
     deviations = _deviations(system, summary, [names[k] for k in columns])
     focal = [d for name, d in deviations.items() if name.startswith("f")]
     center = [d for name, d in deviations.items() if name.startswith("c")]
-    between, _, one_axis = _tilts(system.estimate.rotations)
     mean = system.estimate.camera.mean_focal_length
+    between, tilt, one_axis = _tilts(system.rotations)
     if max(center) > _OPEN_CENTER * longer or max(focal) > _OPEN_FOCAL * mean:
         columns = np.array([k for k in columns if not names[k].startswith("c")])
-        fallbacks += (f"the principal point is held at the centre of the image: {_tilts_in_words(system)}",)
+        told = f"the principal point is held at the centre of the image: {_tilts_in_words(system)}"
         camera = fit.start.camera
         centred = fit.lens.camera(
             camera.width, camera.height, *camera.focal_lengths, camera.width / 2, camera.height / 2
         )
-        estimate = fit.placed(system.observations, centred, False)
+        estimate = fit.placed(system.observations, _without(fit.lens, centred) if fallbacks else centred, False)
         if isinstance(estimate, Rejected):
             return estimate
         system, summary = fit.solve(system.observations, estimate, columns)
         deviations = _deviations(system, summary, [names[k] for k in columns])
         focal = [d for name, d in deviations.items() if name.startswith("f")]
-        mean = system.estimate.camera.mean_focal_length
+        mean, tilt = system.estimate.camera.mean_focal_length, _tilts(system.rotations)[1]
+        fallbacks += (told,)
     elif between < _PARALLEL or one_axis:
         fallbacks += (f"focal length and principal point rest on little: {_tilts_in_words(system)}",)
-    if _tilts(system.estimate.rotations)[1] < _FRONTAL:
+    if tilt < _FRONTAL:
         # The focal length and all distances may grow together, whatever the noise makes of it.
         return Rejected("undetermined_focal", _tilts_in_words(system))
     if not (max(focal) <= _OPEN_FOCAL * mean and mean < 20 * longer):
@@ -72,17 +75,20 @@ def _is_focal_open(deviations: Mapping[str, float], system: CalibrationSystem) -
 
 def _without_spare(fit: Fit, system: CalibrationSystem) -> Checked | Rejected:
     """The solution with the parameters held that the lens can do without."""
-    spare, camera = dict(fit.lens.spare), system.estimate.camera
-    names, params = camera.model_info.param_names, np.array(camera.params)
-    for name, value in spare.items():
-        params[names.index(name)] = value
-    estimate = fit.placed(system.observations, camera.with_params(params), False)
+    spare, names = dict(fit.lens.spare), system.estimate.camera.model_info.param_names
+    estimate = fit.placed(system.observations, _without(fit.lens, system.estimate.camera), False)
     if isinstance(estimate, Rejected):
         return estimate
     columns = np.array([k for k in fit.lens.columns() if names[k] not in spare])
     told = ", ".join(f"{name} is held at {value:g}" for name, value in spare.items())
     words = f"{told}: the photos do not tell it from the focal length"
     return (*fit.solve(system.observations, estimate, columns), columns, (words,))
+
+
+def _without(lens: Lens, camera: Camera) -> Camera:
+    """The camera with the parameters where they are held that the lens can do without."""
+    values = dict(zip(camera.model_info.param_names, camera.params.tolist(), strict=True)) | dict(lens.spare)
+    return camera.with_params(np.array(list(values.values())))
 
 
 def _deviations(system: CalibrationSystem, summary: Summary, names: Sequence[str]) -> dict[str, float]:
@@ -113,7 +119,7 @@ def _tilts(rotations: FloatArray) -> tuple[float, float, bool]:
 
 def _tilts_in_words(system: CalibrationSystem) -> str:
     """How the boards stand to one another and to the image, in degrees, and what would help."""
-    between, tilt, one_axis = _tilts(system.estimate.rotations)
+    between, tilt, one_axis = _tilts(system.rotations)
     views = f"all {len(system.observations)} views"
     if tilt < _FRONTAL:
         return f"{views} within {np.rad2deg(tilt):.0f}° of the image plane; tilt the board by 15° to 45° about two axes"

@@ -158,24 +158,35 @@ class Fit:
 def solve_from_start(
     fit: Fit, observations: Observations, homographies: Homographies
 ) -> tuple[CalibrationSystem, Summary] | Rejected:
-    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once`.
+    """Least squares from the start, on the ways that the lens asks for; see `Lens.at_once` and `Lens.rival`.
 
-    A minimum that is reached at once is taken for the right one. Where `keep_invertible` holds the solution back, it
-    depends on the way where that happens: the parameters are released in stages as well, and the lower cost wins.
+    The first minimum that is reached is taken for the right one. Where `keep_invertible` holds all of them back, the
+    lowest cost of those by stages wins: at once they are held back anywhere, far from anything.
     """
-    first = None
-    if fit.lens.at_once and not fit.has_gross_errors(homographies.errors):
-        estimate = fit.seed_at_once(observations, homographies)
-        if not isinstance(estimate, Rejected):
-            first = fit.solve(observations, estimate)
-            system, summary = first
-            if not fit.config.keep_invertible or system.is_at_minimum(summary.final_cost):
-                return first
-    estimate = fit.seed(observations, homographies.errors)
-    if isinstance(estimate, Rejected):
-        return first or estimate
-    attempts = (first, fit.solve(observations, estimate), _with_other_shape(fit, observations, homographies.errors))
-    return min((one for one in attempts if one is not None), key=lambda one: one[1].final_cost)
+    errors = homographies.errors
+    if fit.lens.at_once and not fit.has_gross_errors(errors):
+        found = _solved(fit, observations, fit.seed_at_once(observations, homographies))
+        held_back = fit.config.keep_invertible and not _is_at_minimum(found)
+        if not isinstance(found, Rejected) and not held_back:
+            return found
+    found = _solved(fit, observations, fit.seed(observations, errors))
+    rival = _rival_of(fit, found)
+    if isinstance(found, Rejected) or rival is None:
+        return found
+    other = _solved(rival, observations, rival.seed(observations, errors))
+    if isinstance(other, Rejected) or found[1].final_cost <= other[1].final_cost:
+        return found
+    return other
+
+
+def _solved(
+    fit: Fit, observations: Observations, estimate: Estimate | Rejected
+) -> tuple[CalibrationSystem, Summary] | Rejected:
+    return estimate if isinstance(estimate, Rejected) else fit.solve(observations, estimate)
+
+
+def _is_at_minimum(solved: tuple[CalibrationSystem, Summary] | Rejected) -> bool:
+    return not isinstance(solved, Rejected) and solved[0].is_at_minimum(solved[1].final_cost)
 
 
 def _spread_over(views: int, most: int) -> list[int]:
@@ -183,14 +194,15 @@ def _spread_over(views: int, most: int) -> list[int]:
     return sorted(set(np.linspace(0, views - 1, min(views, most)).astype(int).tolist()))
 
 
-def _with_other_shape(fit: Fit, observations: Observations, errors: Vector) -> tuple[CalibrationSystem, Summary] | None:
-    """From the other start, where the lens has one."""
-    if not fit.lens.other_shape:
+def _rival_of(fit: Fit, found: tuple[CalibrationSystem, Summary] | Rejected) -> Fit | None:
+    """The second attempt, where the lens has one and needs it."""
+    lens, start = fit.lens, fit.start
+    if lens.other_shape:
+        lens, camera = lens.from_other_shape(start.camera)
+        return dataclasses.replace(fit, lens=lens, start=dataclasses.replace(start, camera=camera))
+    if not lens.rival or _is_at_minimum(found):
         return None
-    lens, camera = fit.lens.from_other_shape(fit.start.camera)
-    other = dataclasses.replace(fit, lens=lens, start=dataclasses.replace(fit.start, camera=camera))
-    estimate = other.seed(observations, errors)
-    return None if isinstance(estimate, Rejected) else other.solve(observations, estimate)
+    return dataclasses.replace(fit, lens=dataclasses.replace(lens, stages=lens.rival))
 
 
 def turned_back(fit: Fit, system: CalibrationSystem) -> Estimate | None:

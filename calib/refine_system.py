@@ -15,7 +15,6 @@ import dataclasses
 import math
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from calib import _refine_kernels as kernels
 from calib.refine_board import BoardShape
@@ -129,6 +128,11 @@ class CalibrationSystem:
         return Estimate(camera, now.rotations.copy(), now.translations.copy(), shape)
 
     @property
+    def rotations(self) -> FloatArray:
+        """(V, 3, 3) of the current poses."""
+        return self._now.rotations
+
+    @property
     def view_costs(self) -> Vector:
         """(V,) half the sum of ρ of each view's residuals."""
         return self._now.costs
@@ -187,20 +191,22 @@ class CalibrationSystem:
 
     def shared_inverse(self, ridge: float = 0.0) -> FloatArray | None:
         """S⁻¹ (K, K) at the current parameters, None where they are not determined; with so much damping, if wanted."""
-        self.linearize()
-        self._bends = self._learns = False
-        self._slope = self._solve(ridge / self._caution)[1]
-        if math.isnan(self._slope):
+        if not self._solve_undamped(ridge):
             return None
-        count = self.shared_count
-        root = solve_triangular(self._F[:count, :count], np.eye(count), lower=True)
+        root = np.linalg.inv(self._F[:-1, :-1])
         return root.T @ root
 
     def newton_decrement(self) -> float:
         """What one more step, all but undamped, promises to take off the cost; inf where there is no such step."""
-        if self.shared_inverse() is None and self.shared_inverse(RIDGE) is None:
+        if not (self._solve_undamped(0.0) or self._solve_undamped(RIDGE)):
             return math.inf
         return -0.5 * self._slope
+
+    def _solve_undamped(self, ridge: float) -> bool:
+        self.linearize()
+        self._bends = self._learns = False
+        self._slope = self._solve(ridge / self._caution)[1]
+        return math.isfinite(self._slope)
 
     def is_at_minimum(self, cost: float) -> bool:
         """Whether one more undamped step promises less than a billionth of the cost."""

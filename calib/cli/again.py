@@ -6,6 +6,7 @@ of detections, so that to calibrate again takes seconds, and commands that show 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -50,7 +51,8 @@ def calibrated_again(
     if not differs <= SAME_PX:
         words = f"by {differs:.3g} px (rms over the image)" if differs == differs else "of another size"
         observer(Note(message=f"note: these photos give another camera than {path}, {words}; this one is shown"))
-    return made, seen
+    told = record.facts.get("would_bring")
+    return (dataclasses.replace(made, would_bring=(str(told),)) if told else made), seen
 
 
 def _board(path: Path, record: CameraRecord, board: str) -> Board:

@@ -111,6 +111,7 @@ class CalibratedCamera(Value):
         flat_px: error on views that were held out with the board taken for flat; NaN where it is not known.
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
+        would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
     """
 
     found: Calibration
@@ -124,6 +125,7 @@ class CalibratedCamera(Value):
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
     flat_px: float = math.nan
+    would_bring: tuple[str, ...] = ()
 
     @property
     def doubts(self) -> CalibrationCovariance | Rejected:
@@ -253,6 +255,7 @@ def calibrate_camera(
         left_out=(*seen.left_out, *found.rejected_views),
         findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
+        would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
 
 
@@ -271,6 +274,12 @@ def _held_out_flat(
         return math.nan
     held = hold_out(seen.points3D, flat, plain, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     return math.nan if isinstance(held, Rejected) else held.rms_px
+
+
+def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
+    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
+    able = [row for row in rows if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _findings(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib import __version__
-from calib.cli.calibrating import CalibratedCamera, Sightings
+from calib.cli.calibrating import CalibratedCamera, Sightings, would_bring
 from calib.cli.suggestions_text import suggestion_lines, suggestions_json
 from calib.next_views import SuggestedView
 from calib.refine import Calibration
@@ -49,6 +49,8 @@ def record_of(made: CalibratedCamera, seen: Sightings, *, command: str) -> Camer
     ):
         if value is not None and math.isfinite(value):
             facts[key] = value
+    if made.would_bring:
+        facts["would_bring"] = "; ".join(made.would_bring)
     return CameraRecord(
         facts,
         _parameter_covariance(made),
@@ -84,7 +86,7 @@ def camera_json(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Sug
         "board": {"spec": _spec(seen), "shape": found.shape.kind} | _board(found),
         "lenses": [_row(row, row.lens) for row in made.lenses],
         "shapes": [_row(row, row.kind) for row in made.shapes],
-        "would_bring": would_bring(made.lenses) + would_bring(made.shapes),
+        "would_bring": list(made.would_bring),
         seen.kind: {"count": seen.count, "digest": seen.digest},
         "views": _views(found),
         "rejected": [dataclasses.asdict(view) for view in made.left_out],
@@ -164,12 +166,6 @@ def _board_lines(made: CalibratedCamera) -> Iterator[str]:
         why = f"  not taken{'' if row.would_bring else f': {row.refused}'}" if row.refused else ""
         yield f"  {row.kind:<12}held-out {_px(row.held_out_rms_px)} px{why}"
     yield from (f"  {sentence}" for sentence in would_bring(made.shapes))
-
-
-def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
-    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
-    able = [row for row in rows if row.would_bring]
-    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _left_out_lines(made: CalibratedCamera) -> Iterator[str]:

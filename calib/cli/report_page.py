@@ -10,7 +10,6 @@ import numpy as np
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
-from calib.cli.camera_report import would_bring
 from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
 from calib.diagnose import Finding
 from calib.refine import Calibration
@@ -37,7 +36,7 @@ def report_page(
         f"<h1>{escape(name)}</h1>",
         f'<p class="quiet">{escape(_in_short(found))}</p>',
         *_findings(result.findings),
-        "<h2>How good it is</h2>", _quality(result),
+        "<h2>How good it is</h2>", _quality(result), *_would_bring(result),
         "<h2>Parameters</h2>", _parameters(result),
         *_ranked(result),
         "<h2>Where the photos showed the board</h2>",
@@ -96,6 +95,10 @@ def _quality(result: CalibratedCamera) -> str:
     return table([], [[label, value] for label, value in rows])
 
 
+def _would_bring(result: CalibratedCamera) -> list[str]:
+    return [f"<p>{escape(sentence[:1].upper() + sentence[1:])}.</p>" for sentence in result.would_bring]
+
+
 def _parameters(result: CalibratedCamera) -> str:
     found = result.found
     plain, by_view = (
@@ -119,14 +122,12 @@ def _ranked(result: CalibratedCamera) -> Iterator[str]:
             [lens.lens, *([in_px(lens.rms_px), in_px(lens.held_out_rms_px), in_px(lens.differs_px)] if not lens.refused
              else ["", "", f"refused: {lens.refused}"])] for lens in result.lenses
         ])  # fmt: skip
-        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.lenses))
     if result.shapes:
         yield "<h2>Shapes of the board, likewise</h2>"
         yield table(["", "training", "held out", "uncertainty of the camera, at least", ""], [
             [shape.kind, in_px(shape.rms_px), in_px(shape.held.rms_px if shape.held else np.nan),
              in_px(shape.camera_bound_px), shape.refused] for shape in result.shapes
         ])  # fmt: skip
-        yield from (f"<p>{escape(sentence)}.</p>" for sentence in would_bring(result.shapes))
 
 
 def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:

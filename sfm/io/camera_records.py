@@ -17,6 +17,7 @@ holdout_flat_px = 0.1735          # the same with the board taken for flat
 split_half_px = 0.9               # difference of the cameras of two halves of the views, over the image
 uncertainty_px = 0.4              # standard deviation of a pixel far away, over the image, by views if they are enough
 converged = true
+would_bring = "a free board shape would bring …"   # what was not taken though it predicts photos better
 
 [uncertainty]
 free = ["fx", "fy", …]            # the parameters that were estimated
@@ -54,7 +55,7 @@ from sfm.core.errors import FormatError
 
 Fact: TypeAlias = str | int | float | bool
 _FACTS: dict[type, tuple[str, ...]] = {
-    str: ("command", "date", "version", "lens", "kind", "photos_digest"),
+    str: ("command", "date", "version", "lens", "kind", "photos_digest", "would_bring"),
     int: ("photos", "views", "corners"),
     float: ("rms_px", "sigma_px", "holdout_rms_px", "holdout_flat_px", "split_half_px", "uncertainty_px"),
     bool: ("converged",),

@@ -131,6 +131,48 @@ def test_photos_of_the_same_camera_pass_and_of_another_fail(sfm, corners, tmp_pa
         assert failed.stdout.startswith("FAILED: ")
 
 
+def test_an_error_that_opencv_s_file_states_far_above_ours_is_a_cause(sfm, corners, tmp_path):
+    k1, k2, p1, p2 = LENS.params[4:]
+    fx, fy, cx, cy = LENS.params[:4]
+    (tmp_path / "c.yml").write_text(
+        "%YAML:1.0\n---\nimage_width: 1280\nimage_height: 960\n"
+        f"camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        f"   data: [ {fx}, 0., {cx - 0.5}, 0., {fy}, {cy - 0.5}, 0., 0., 1. ]\n"
+        f"distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n   dt: d\n"
+        f"   data: [ {k1}, {k2}, {p1}, {p2} ]\n"
+        "avg_reprojection_error: 0.41\n"
+    )
+    result = sfm("check", "c.yml", "other.json", "--json", module="calib")
+    assert result.returncode == 0, result.stdout + result.stderr
+    told = json.loads(result.stdout)
+    assert told["calibration"]["rms_px"] == 0.41
+    assert told["limit_px"] == 0.82
+    assert "worse_corners" in [finding["cause"] for finding in told["findings"]]
+
+
+def test_a_shape_that_would_bring_more_is_told_in_one_sentence(sfm, tmp_path, rng):
+    """Corners that lie 0.2 mm off their design, in too few photos to say where."""
+    off = flat_board() + rng.normal(0, 2e-4, (54, 3))
+    images = {}
+    for view in seen(LENS, off, poses_before(LENS, 14, rng), rng):
+        ones = np.tile(np.eye(2), (len(view.corner_ids), 1, 1))
+        images[view.name] = detection_json(
+            Detection(view.name, view.width, view.height, view.corner_ids, view.points2D, ones)
+        )
+    document = {"board": BOARD.spec, "points3D": BOARD.points3D.tolist(), "pixel_center": 0.5, "images": images}
+    (tmp_path / "corners.json").write_text(json.dumps(document))
+    words = ("camera", "corners.json", "--model", "opencv", "-o", "c.toml")
+    told = json.loads(sfm(*words, "--json", module="calib").stdout)
+    assert told["board"]["shape"] != "free"
+    assert told["holdout_rms_px"] < 1.05 * told["rms_px"]
+    (sentence,) = told["would_bring"]
+    assert sentence.startswith("a free board shape would bring the error of photos held out from")
+    assert sentence.endswith("photos like these, or --shape free")
+    assert sentence in sfm(*words, module="calib").stdout
+    assert sfm("report", "c.toml", "corners.json", "-o", "c.html", module="calib").returncode == 0
+    assert sentence[1:] in (tmp_path / "c.html").read_text()
+
+
 def test_resized_photos_are_checked_by_the_resized_camera(sfm, corners, tmp_path, rng):
     assert sfm("camera", "corners.json", "--model", "opencv", "-o", "c.toml", module="calib").returncode == 0
     half = LENS.scaled(640, 480)
