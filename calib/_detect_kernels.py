@@ -159,9 +159,11 @@ def _descend(xs, ys, grey, count, p, iterations):
         new = _normal_equations(xs, ys, grey, count, trial, trial_matrix, trial_vector)
         if new < cost:
             settled = math.hypot(trial[0] - p[0], trial[1] - p[1]) < _SETTLED_PX and cost - new < 1e-4 * cost
-            p[:] = trial
-            matrix[:] = trial_matrix
-            vector[:] = trial_vector
+            # Copies by whole slices would compile numba's message for shapes that differ: three seconds.
+            for a in range(PARAMETERS):
+                p[a], vector[a] = trial[a], trial_vector[a]
+                for b in range(PARAMETERS):
+                    matrix[a, b] = trial_matrix[a, b]
             cost = new
             damping = max(damping * 0.1, 1e-9)
             if settled:

@@ -78,6 +78,9 @@ def main(words: Sequence[str]) -> int:
     beside = write_poses_beside(options.output, cameras, name)
     if beside:
         print(f"poses: {', '.join(map(str, beside))}")
+    old = options.output.with_name(f"rigs{options.output.suffix.lower()}")
+    if name == "colmap" and not beside and old.exists():
+        print(f"note: {old} was there before and is not of these cameras; COLMAP would read both")
     for remark in _lost(cameras, name, beside):
         print(remark)
     return ExitCode.OK

@@ -71,7 +71,7 @@ def rig_again(path: Path, words: Sequence[str], board: str, *, threads: int, obs
     seen, table = see_rig(files, shown, pair=pairing, threads=threads)
     kind = file.provenance.get("shape")
     shape = cast("ShapeKind", kind) if kind in SHAPES else "flat"
-    cameras = [_camera(file, c, seen, table) for c in range(len(file.rig))]
+    cameras = [_camera(file, c, seen, table, path) for c in range(len(file.rig))]
     ranked = choose_rig_shape(shown.points3D, cameras, _config(file), turns=board_turns(shown), shapes=(shape,))
     if isinstance(ranked, Rejected):
         raise rig_refused(ranked, seen)
@@ -99,14 +99,14 @@ def sources_of(words: Sequence[str], names: Sequence[str], path: Path) -> dict[s
     raise ConfigError(told, path=path, remedy=f"name a folder for each: {' '.join(f'{name}=DIR' for name in names)}")
 
 
-def _camera(file: RigFile, c: int, seen: Mapping[str, Sightings], table: FrameTable) -> RigCamera:
+def _camera(file: RigFile, c: int, seen: Mapping[str, Sightings], table: FrameTable, path: Path) -> RigCamera:
     name, camera = file.rig.names[c], file.rig.cameras[c]
     lens = str(file.provenance.get(f"lens_{name}", ""))
     given = lens == GIVEN
     try:
         lens = lens_called(lens).name if lens and not given else lens_of(camera)
     except ValueError as error:
-        raise ConfigError(str(error)) from error
+        raise ConfigError(str(error), path=path) from error
     views = seen[name].views
     frames = tuple(table.frames[name][view.name] for view in views)
     return RigCamera(name, views, frames, lens, camera if given else None)

@@ -12,7 +12,7 @@ from calib import __version__
 from calib import report_rig_figures as figures
 from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
 from calib.cli.rig_again import RigAgain
-from calib.cli.rig_report import rig_remarks
+from calib.cli.rig_report import WOULD_BRING, rig_remarks
 from calib.diagnose import diagnose
 from calib.report_figures import board_figure, coverage_figure, residual_field_figure
 from calib.rig_epipolar import epipolar_errors
@@ -188,7 +188,8 @@ def _quality(made: RigAgain) -> str:
         ["noise of one coordinate of a corner (σ), each camera by its own", f"{found.sigma_px:.4f} px"],
         ["converged", "yes" if found.converged else "no"],
     ]  # fmt: skip
-    return table([], rows)
+    sentence = str(made.file.provenance.get(WOULD_BRING, ""))
+    return table([], rows) + (f"<p>{escape(sentence[:1].upper() + sentence[1:])}.</p>" if sentence else "")
 
 
 def _cameras(found: RigCalibration, *covariances: RigCovariance | Rejected) -> Iterator[str]:

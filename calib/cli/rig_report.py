@@ -23,15 +23,16 @@ from sfm.core.scene import CameraRig
 from sfm.io.rig_files import MountedSigmas, RigFile
 
 _SHOWN = 12
+WOULD_BRING = "would_bring"
 GIVEN = "given"
 """In place of a lens, in the file of a rig: the camera was known before."""
 
 
 def rig_record(
-    ranked: RankedRig, seen: Mapping[str, Sightings], table: FrameTable, board: Board, command: str
+    ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table: FrameTable, board: Board, command: str
 ) -> RigFile:
     """What goes to the disk: the rig, and what it takes to make it again from its photos."""
-    found = _found(ranked)
+    found, held = _found(ranked[0]), ranked[0].held
     covariances = rig_covariance(found)
     facts: dict[str, str | int | float | bool] = {
         "command": command,
@@ -41,7 +42,8 @@ def rig_record(
         "frames": len(found.observations.frames),
         "sigma_px": found.sigma_px,
         "converged": found.converged,
-        **({"holdout_rms_px": ranked.held.rms_px} if ranked.held else {}),
+        **({"holdout_rms_px": held.rms_px} if held else {}),
+        **({WOULD_BRING: told[0]} if (told := would_bring(ranked)) else {}),
         "paired_by": table.by,
         **_intrinsics(found),
         **{f"photos_{name}": f"{one.count}, digest {one.digest}" for name, one in seen.items()},

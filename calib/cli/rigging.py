@@ -43,7 +43,7 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
         ranked = _calibrated(board, cameras, board_turns(board), options)
     if isinstance(ranked, Rejected):
         raise rig_refused(ranked, seen)
-    write_rig_file(options.output, rig_record(ranked[0], seen, table, board, command))
+    write_rig_file(options.output, rig_record(ranked, seen, table, board, command))
     if options.json:
         import json
 

@@ -76,3 +76,5 @@ def test_the_poses_of_a_rig_go_beside_the_cameras_or_are_said_to_be_left_out(tmp
     capsys.readouterr()
     assert main(["convert", str(tmp_path / "rig.toml"), "-o", str(tmp_path / "two.txt")]) == ExitCode.OK
     assert "the poses of the rig are not in it" in capsys.readouterr().out
+    assert main(["convert", str(tmp_path / "rig.toml"), "-o", str(tmp_path / "cameras.txt"), "--camera", "left"]) == 0
+    assert "rigs.txt was there before" in capsys.readouterr().out

@@ -234,6 +234,12 @@ def test_the_page_tells_baselines_with_both_sigmas_and_asks_nothing_of_the_netwo
     assert page.count("<svg") == 2 + 3 + 1 + 2 + 6 + 1  # rig, pairs, frames, boards, cameras, shape
 
 
+def test_what_another_shape_would_bring_stands_on_the_page(made):
+    facts = {**made.file.provenance, "would_bring": "a free board would bring <more>"}
+    page = rig_page("rig", dataclasses.replace(made, file=dataclasses.replace(made.file, provenance=facts)))
+    assert "<p>A free board would bring &lt;more&gt;.</p>" in page
+
+
 def test_the_worst_photos_are_shown_where_they_can_be_read(made):
     views = worst_rig_views(made.found)
     errors = [made.found.one_camera(c).view_rms_px.max() for c in range(3)]

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from sfm.core.cameras import MODELS, Camera
 from sfm.core.errors import ConfigError
+from sfm.core.events import SILENT
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.scene import CameraRig
+from sfm.io.database import Database
+from sfm.io.rig_files import RigFile, write_rig_file
+from sfm.pipeline.config import CameraConfig
 from sfm.pipeline.intrinsics import assigned_cameras, resized_camera
+from sfm.pipeline.scene import read_scene
 
 
 def camera(width: int = 640, height: int = 480, f: float = 500.0) -> Camera:
@@ -109,3 +117,18 @@ def test_photos_that_no_name_fits_go_by_size_and_are_refused_where_that_leaves_a
 def test_a_photo_of_another_shape_than_its_camera_is_refused():
     with pytest.raises(ConfigError, match=r"for 640×480 px, but cam1/a has 800×500 px"):
         assigned_cameras(RIG, [("cam1/a", 800, 500)], "rig.toml", NAMES)
+
+
+def test_photos_of_a_rig_get_the_cameras_of_their_folders(tmp_path):
+    beside = Rigid3.stack([Rigid3.identity(), Rigid3.exp(np.array([0, 0, 0, -0.1, 0, 0]))])
+    rig = CameraRig(("left", "right"), (camera(f=500.0), camera(f=510.0)), beside, "left")
+    write_rig_file(tmp_path / "rig.toml", RigFile(rig))
+    for name in ("left/0.png", "left/1.png", "right/0.png"):
+        (tmp_path / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(tmp_path / "photos" / name), np.full((480, 640), 90, np.uint8))
+    with Database.open(tmp_path / "database.db") as database:
+        config = CameraConfig(intrinsics=str(tmp_path / "rig.toml"))
+        scene = read_scene(database, tmp_path / "photos", config, threads=1, observer=SILENT)
+    taken = {image.name: image.camera.params[0] for image in scene.images.values()}
+    assert taken == {"left/0.png": 500, "left/1.png": 500, "right/0.png": 510}
+    assert len({image.camera_id for image in scene.images.values()}) == 2
