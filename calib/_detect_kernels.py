@@ -2,11 +2,16 @@
 
 Two straight edges of a board cross at c; seen through a lens of Gaussian blur s they are
 
-    I(x) = μ + g·d + α erf(u1 / √2 s) erf(u2 / √2 s),      d = x − c,   u_k = n_k·d + ½ κ_k (t_k·d)²,
+    I(x) = μ + g·d + α erf(u1 / √2 s) erf(u2 / √2 s),      d = x − c,   u_k = n_k·d + ½ κ_k ((t_k·d)² + s²),
 
 n_k the unit normal of edge k at angle θ_k, t_k its direction, κ_k its curvature in the image (what distortion makes of
-a straight line: without it, the crossing would be drawn inwards by κ r² / 6). The eleven parameters are
+a straight line: without it, the crossing would be drawn inwards by κ r² / 6). Blur moves a bent edge inwards by ½ κ s²:
+on its outer side there is less to be spread. The eleven parameters are
 (cx, cy, θ1, θ2, s, μ, α, gx, gy, κ1, κ2).
+
+Seen from the crossing, what g and κ do to the image is odd, as is what a shift of c does; the rest is even. In a small
+window these four are therefore nearly all that makes c uncertain, while the neighbours of a crossing know them well. So
+they may be given expected values e_k with weights w_k, and Σ w_k (p_k − e_k)² is added to the squared residuals.
 """
 
 from __future__ import annotations
@@ -17,6 +22,8 @@ import numpy as np
 from numba import njit
 
 PARAMETERS = 11
+EXPECTED = 7
+"""The first of the four parameters that may be expected to have some value."""
 _DAMPING_START = 1e-3
 _DAMPING_LIMIT = 1e8
 _SHARPEST_PX = 0.2
@@ -28,13 +35,15 @@ _SLOPE_AT_EDGE = math.sqrt(2.0 / math.pi)
 
 @njit(cache=True, nogil=True)
 def _edge(nx, ny, curvature, blur, dx, dy):
-    """erf(u / √2 s) of one edge, its derivative by u, then u and its derivatives by x, y, angle and curvature."""
+    """erf(u / √2 s) of one edge, its derivative by u, and that by blur, x, y, angle and curvature over it."""
     across, along = nx * dx + ny * dy, nx * dy - ny * dx
-    reach = across + 0.5 * curvature * along * along
+    square = along * along + blur * blur
+    reach = across + 0.5 * curvature * square
     z = reach / (_ROOT_2 * blur)
     slope = _SLOPE_AT_EDGE / blur * math.exp(-z * z)
     by_x, by_y = nx - curvature * along * ny, ny + curvature * along * nx
-    return math.erf(z), slope, reach, by_x, by_y, along - curvature * along * across, 0.5 * along * along
+    by_blur = curvature * blur - reach / blur
+    return math.erf(z), slope, by_blur, by_x, by_y, along - curvature * along * across, 0.5 * square
 
 
 @njit(cache=True, nogil=True)
@@ -43,14 +52,14 @@ def crossing_model(p, nx1, ny1, nx2, ny2, dx, dy, jacobian):
 
     n1 and n2 are the normals, (cos θ, sin θ) of p[2] and p[3].
     """
-    value1, slope1, reach1, by_x1, by_y1, by_angle1, by_bow1 = _edge(nx1, ny1, p[9], p[4], dx, dy)
-    value2, slope2, reach2, by_x2, by_y2, by_angle2, by_bow2 = _edge(nx2, ny2, p[10], p[4], dx, dy)
+    value1, slope1, by_blur1, by_x1, by_y1, by_angle1, by_bow1 = _edge(nx1, ny1, p[9], p[4], dx, dy)
+    value2, slope2, by_blur2, by_x2, by_y2, by_angle2, by_bow2 = _edge(nx2, ny2, p[10], p[4], dx, dy)
     left, right = p[6] * slope1 * value2, p[6] * slope2 * value1
     jacobian[0] = -(left * by_x1 + right * by_x2) - p[7]
     jacobian[1] = -(left * by_y1 + right * by_y2) - p[8]
     jacobian[2] = left * by_angle1
     jacobian[3] = right * by_angle2
-    jacobian[4] = -(left * reach1 + right * reach2) / p[4]
+    jacobian[4] = left * by_blur1 + right * by_blur2
     jacobian[5] = 1.0
     jacobian[6] = value1 * value2
     jacobian[7] = dx
@@ -61,8 +70,8 @@ def crossing_model(p, nx1, ny1, nx2, ny2, dx, dy, jacobian):
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(xs, ys, grey, count, p, matrix, vector):
-    """JᵀJ (its lower triangle), Jᵀr and the sum of squared residuals of the pixels."""
+def _normal_equations(xs, ys, grey, count, expected, weights, p, matrix, vector):
+    """JᵀJ (its lower triangle), Jᵀr and the sum of squared residuals, of the pixels and of what was expected."""
     jacobian = np.empty(PARAMETERS)
     matrix[:] = 0.0
     vector[:] = 0.0
@@ -75,6 +84,12 @@ def _normal_equations(xs, ys, grey, count, p, matrix, vector):
             vector[a] += jacobian[a] * residual
             for b in range(a + 1):
                 matrix[a, b] += jacobian[a] * jacobian[b]
+    for k in range(len(weights)):
+        a = EXPECTED + k
+        off = p[a] - expected[k]
+        matrix[a, a] += weights[k]
+        vector[a] += weights[k] * off
+        cost += weights[k] * off * off
     return cost
 
 
@@ -139,13 +154,13 @@ def _gather(image, x, y, window, xs, ys, grey):
 
 
 @njit(cache=True, nogil=True)
-def _descend(xs, ys, grey, count, p, iterations):
+def _descend(xs, ys, grey, count, expected, weights, p, iterations):
     """Levenberg–Marquardt from `p`, in place; the final cost, NaN where the pixels do not determine the parameters."""
     matrix, low = np.zeros((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
     vector, step, trial = np.zeros(PARAMETERS), np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     trial_matrix, trial_vector = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
     damping = _DAMPING_START
-    cost = _normal_equations(xs, ys, grey, count, p, matrix, vector)
+    cost = _normal_equations(xs, ys, grey, count, expected, weights, p, matrix, vector)
     for _ in range(iterations):
         if not _factor(matrix, damping, low):
             damping *= 10.0
@@ -156,7 +171,7 @@ def _descend(xs, ys, grey, count, p, iterations):
         for a in range(PARAMETERS):
             trial[a] = p[a] - step[a]
         trial[4] = max(min(max(trial[4], 0.5 * p[4]), 2.0 * p[4]), _SHARPEST_PX)
-        new = _normal_equations(xs, ys, grey, count, trial, trial_matrix, trial_vector)
+        new = _normal_equations(xs, ys, grey, count, expected, weights, trial, trial_matrix, trial_vector)
         if new < cost:
             settled = math.hypot(trial[0] - p[0], trial[1] - p[1]) < _SETTLED_PX and cost - new < 1e-4 * cost
             # Copies by whole slices would compile numba's message for shapes that differ: three seconds.
@@ -176,14 +191,23 @@ def _descend(xs, ys, grey, count, p, iterations):
 
 
 @njit(cache=True, nogil=True)
-def _covariance(xs, ys, grey, count, p, out):
-    """Rows of the parameters' covariance that belong to the crossing; False where there is none."""
+def _covariance(xs, ys, grey, count, expected, weights, p, square, out):
+    """Rows of the parameters' covariance that belong to the crossing, by the sum of squares; False where there is none.
+
+    A parameter takes away a degree of freedom as far as it is told by the pixels and not by what was expected of it.
+    """
     matrix, low = np.zeros((PARAMETERS, PARAMETERS)), np.zeros((PARAMETERS, PARAMETERS))
     vector, column = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    cost = _normal_equations(xs, ys, grey, count, p, matrix, vector)
+    _normal_equations(xs, ys, grey, count, expected, weights, p, matrix, vector)
     if not _factor(matrix, 0.0, low):
         return False
-    variance = cost / max(count - PARAMETERS, 1)
+    freedom = float(count - PARAMETERS)
+    for k in range(len(weights)):
+        vector[:] = 0.0
+        vector[EXPECTED + k] = 1.0
+        _solve(low, vector, column)
+        freedom += weights[k] * column[EXPECTED + k]
+    variance = square / max(freedom, 1.0)
     for k in range(2):
         vector[:] = 0.0
         vector[k] = 1.0
@@ -193,19 +217,18 @@ def _covariance(xs, ys, grey, count, p, out):
 
 
 @njit(cache=True, nogil=True)
-def fit_crossings(image, points, windows, angles, capacity, out, covariances, fitted):
+def fit_crossings(image, windows, capacity, expected, weights, starts, shapes, covariances, fitted):
     """Fits every crossing; NaN where the pixels are cut off by the border or do not show one.
 
-    `fitted` receives (blur s, contrast α, root mean square of the residuals, pixels).
+    `starts` holds cx, cy, θ1, θ2 and either s > 0 and the rest, or nothing more; `fitted` receives the root mean square
+    of the pixels' residuals.
     """
     xs, ys, grey = np.empty(capacity), np.empty(capacity), np.empty(capacity)
-    for i in range(len(points)):
-        out[i] = math.nan
+    for i in range(len(starts)):
+        shapes[i] = math.nan
         covariances[i] = math.nan
         fitted[i] = math.nan
-        p = np.zeros(PARAMETERS)
-        p[0], p[1] = points[i, 0], points[i, 1]
-        p[2], p[3] = angles[i, 0], angles[i, 1]
+        p = starts[i].copy()
         cost = math.nan
         count = 0
         for attempt in range(3):
@@ -213,15 +236,17 @@ def fit_crossings(image, points, windows, angles, capacity, out, covariances, fi
             if count < 2 * PARAMETERS:
                 cost = math.nan
                 break
-            if attempt == 0:
+            if attempt == 0 and not p[4] > 0.0:
                 _start(xs, ys, grey, count, p)
             before_x, before_y = p[0], p[1]
-            cost = _descend(xs, ys, grey, count, p, 40)
+            cost = _descend(xs, ys, grey, count, expected[i], weights[i], p, 40)
             if not cost >= 0.0 or math.hypot(p[0] - before_x, p[1] - before_y) < 0.25:
                 break
-        if cost >= 0.0 and _covariance(xs, ys, grey, count, p, covariances[i]):
-            out[i, 0], out[i, 1] = p[0], p[1]
-            fitted[i, 0], fitted[i, 1], fitted[i, 2], fitted[i, 3] = p[4], p[6], math.sqrt(cost / count), count
+        for k in range(len(weights[i])):
+            cost -= weights[i, k] * (p[EXPECTED + k] - expected[i, k]) ** 2
+        if cost >= 0.0 and _covariance(xs, ys, grey, count, expected[i], weights[i], p, cost, covariances[i]):
+            shapes[i] = p
+            fitted[i] = math.sqrt(cost / count)
 
 
 @njit(cache=True, nogil=True)

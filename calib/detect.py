@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64, UInt8
 
 from calib.boards import Board
 from calib.detect_circles import fit_circles, without_shifts
-from calib.detect_crossings import fit_crossings
+from calib.detect_crossings import Expectations, expectations, fit_crossings
 from calib.detect_grids import Found, candidates
 from calib.detect_neighbours import Affines, local_affines, predicted
 from sfm.core.arrays import Mask, Points2D, Value, readonly
@@ -31,6 +31,10 @@ _LARGEST_GAIN = 3.0
 amplified by no more than this. Farther out, something else would be found and agree with itself."""
 _LEAST_BEND = 0.08
 """Of the distance of neighbours; at the edge of a fisheye image the best quadratic function is off by 0.06."""
+_LEAST_NEIGHBOURS = 10
+"""Corners that a board must have for these to say something about each other."""
+_MEDIAN_LENGTH = 1.17741
+"""Of a pair of unit normal numbers."""
 _FLAT_PX = 0.5
 """Corners that are as near to each other as this are no board."""
 
@@ -54,6 +58,10 @@ class DetectConfig:
 
     min_contrast: float = 0.2
     """Least contrast by the median of the board."""
+
+    max_deviation: float = 0.05
+    """A corner's standard deviation in its worst direction by the distance to its neighbours: above, its fit went
+    astray, as when both edges become one."""
 
     max_bend: float = 6.0
     """Most deviation from where the neighbours want a corner, by the median deviation of the board's corners."""
@@ -102,15 +110,17 @@ class Detection(Value):
 
 @dataclasses.dataclass(slots=True)
 class _Corners:
-    """Corners under judgement, in order of their ids; those that fell stay, with a reason."""
+    """Corners under judgement, in order of their ids; those that fell stay, with a reason.
+
+    `shapes` and `misfit` are those of `Crossings`, NaN for circles.
+    """
 
     ids: Int64[np.ndarray, " N"]
     sought: Points2D
     points2D: Points2D
     covariances: Float64[np.ndarray, "N 2 2"]
-    contrast: Float64[np.ndarray, " N"]
+    shapes: Float64[np.ndarray, "N 11"]
     misfit: Float64[np.ndarray, " N"]
-    blur_px: Float64[np.ndarray, " N"]
     reasons: dict[int, str] = dataclasses.field(default_factory=dict)
 
     @property
@@ -148,7 +158,7 @@ def detect_board(
     kept = best.kept
     if kept.sum() < least:
         return Rejected("too_few_corners", f"{kept.sum()} of {len(board.points3D)} passed, {least} needed")
-    blur = best.blur_px[kept]
+    blur = best.shapes[kept, 4]
     return Detection(
         name,
         grey.shape[1],
@@ -184,7 +194,7 @@ def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig)
     corners = _fitted_crossings(grey, board, ids, points2D, affines, config)
     if board.has_markers:
         corners = _completed(grey, board, corners, config)
-    return corners
+    return _by_neighbours(grey, board, corners, config)
 
 
 def _on_board(board: Board, ids: np.ndarray) -> Points2D:
@@ -212,17 +222,19 @@ def _as_printed(
 
 
 def _fitted_crossings(
-    grey: np.ndarray, board: Board, ids: np.ndarray, points2D: Points2D, affines: Affines, config: DetectConfig
-) -> _Corners:
-    """Corners near `points2D`, with a verdict on each."""
-    fitted = fit_crossings(grey, points2D, affines, config.window * board.clear_radius_m, config.max_window_px)
-    corners = _Corners(
-        ids, points2D, fitted.points2D, fitted.covariances, fitted.contrast, fitted.misfit, fitted.blur_px
-    )
+    grey: np.ndarray, board: Board, ids: np.ndarray, sought: Points2D, affines: Affines, config: DetectConfig,
+    expected: Expectations | None = None,
+) -> _Corners:  # fmt: skip
+    """Corners near where they are sought, with a verdict on each."""
+    starts = sought if expected is None else expected.shapes[:, :2]
+    fitted = fit_crossings(grey, starts, affines, config.window * board.clear_radius_m, config.max_window_px, expected)
+    corners = _Corners(ids, sought, np.array(fitted.points2D), fitted.covariances, fitted.shapes, fitted.misfit)
     corners.reject(np.isnan(fitted.misfit), "cut off, or no crossing")
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * 2 * board.clear_radius_m
-    jumped = np.linalg.norm(fitted.points2D - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0)
+    jumped = np.linalg.norm(fitted.points2D - sought, axis=1) > np.maximum(config.max_jump * spacing, 1.0)
     corners.reject(jumped, "jumped")
+    worst = np.sqrt(np.linalg.norm(np.nan_to_num(fitted.covariances), 2, axis=(1, 2)))
+    corners.reject(worst > config.max_deviation * spacing, "too uncertain")
     _judge_colours(board, corners, config)
     _judge_places(board, corners, config)
     return corners
@@ -230,7 +242,7 @@ def _fitted_crossings(
 
 def _judge_colours(board: Board, corners: _Corners, config: DetectConfig) -> None:
     """Contrast, its sign and what the model leaves of the pixels."""
-    signed = np.where(board.diagonal_is_black[corners.ids], 1, -1) * corners.contrast
+    signed = np.where(board.diagonal_is_black[corners.ids], 1, -1) * corners.shapes[:, 6]
     if np.nansum(np.sign(signed)) < 0:  # the older ChArUco layout, or a board printed in reverse
         signed = -signed
     typical = np.nanmedian(np.abs(signed)) if np.isfinite(signed).any() else 0.0
@@ -282,17 +294,27 @@ def _completed(grey: np.ndarray, board: Board, corners: _Corners, config: Detect
         is_old = np.isin(tried.ids, corners.ids)
         told = {number: reason for number, reason in tried.reasons.items() if number in set(tried.ids[is_old].tolist())}
         stays = tried.kept | is_old
-        fields = (
-            tried.ids,
-            tried.sought,
-            tried.points2D,
-            tried.covariances,
-            tried.contrast,
-            tried.misfit,
-            tried.blur_px,
-        )
+        fields = (tried.ids, tried.sought, tried.points2D, tried.covariances, tried.shapes, tried.misfit)
         corners = _Corners(*(values[stays] for values in fields), reasons=told)
     return corners
+
+
+def _by_neighbours(grey: np.ndarray, board: Board, corners: _Corners, config: DetectConfig) -> _Corners:
+    """All corners fitted again with what their neighbours say of them, and judged anew."""
+    kept = corners.kept
+    if kept.sum() < _LEAST_NEIGHBOURS:
+        return corners
+    places = _on_board(board, corners.ids)
+    wanted, gain = predicted(places, places[kept], corners.points2D[kept])
+    errors_px = float(np.median((np.linalg.norm(wanted - corners.points2D, axis=1) / gain)[kept])) / _MEDIAN_LENGTH
+    noise = float(np.median(np.abs(corners.misfit * corners.shapes[:, 6])[kept]))
+    shapes = corners.shapes.copy()
+    shapes[~kept] = np.nan
+    shapes[~kept, :2] = np.where(gain[~kept, None] < _LARGEST_GAIN, wanted[~kept], corners.sought[~kept])
+    expected = expectations(places, shapes, kept, (grey.shape[1], grey.shape[0]), errors_px, noise)
+    return _fitted_crossings(
+        grey, board, corners.ids, corners.sought, local_affines(places, shapes[:, :2]), config, expected
+    )
 
 
 def _fitted_circles(
@@ -302,7 +324,7 @@ def _fitted_circles(
     noise = 255 * noise_sigma(np.ascontiguousarray(grey))
     centroids, covariances = fit_circles(grey, points2D, affines, board, noise)
     nothing = np.full(len(ids), np.nan)
-    corners = _Corners(ids, points2D, centroids, covariances, nothing, nothing, nothing)
+    corners = _Corners(ids, points2D, centroids, covariances, np.full((len(ids), 11), np.nan), nothing)
     corners.reject(np.isnan(centroids[:, 0]), "cut off, or no circle")
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * board.pitch_m
     corners.reject(np.linalg.norm(centroids - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0), "jumped")

@@ -4,9 +4,19 @@ With unit noise the covariance of what views share is Σ = S⁻¹ (see `refine_s
 
     H_v⁻¹ + H_v⁻¹ W_vᵀ Σ W_v H_v⁻¹
 
-both times the variance σ² of the residuals. It is a lower bound: it takes residuals for independent. `by_view` does
-not:
-it takes only the views for independent. Each is left out in turn, by one Newton step from the solution,
+both times the variance σ² of the residuals, if all corners are equally certain. They are not: one of a small or
+slanted square errs twice as much as one of a large square, and where it counts most. So every corner i speaks for
+itself, by its own residual e_i. With D_i (2, K) its derivatives by what views share, those by the pose projected out,
+and h_i its leverage, the part of its own error that the fit has followed,
+
+    Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ,      r_i = (I − h_i)^−½ e_i
+
+which is right on average where corners are alike as well. Rejection of corners beyond a length c makes e_i small and
+the others' say too great: a residual near c is lost or kept by little. With ρ the density of lengths there, all is
+divided by (1 − ½ c ρ)².
+
+Both take residuals for independent. `by_view` takes only the views for independent: each is left out in turn, by one
+Newton step from the solution,
 
     θ₋ᵥ − θ = (S − S_v)⁻¹ s_v,      s_v = J_vᵀ e_v the view's part of the gradient
 
@@ -24,6 +34,7 @@ for a point p of the camera frame; for one infinitely far ξ is its turn alone.
 
 Reference:
     Kogan, mrcal, Projection uncertainty (documentation): the idea, and the implied movement of the frame.
+    MacKinnon & White, Some heteroskedasticity-consistent covariance matrix estimators, 1985: HC2.
     Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples, 2002.
 """
 
@@ -35,7 +46,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from calib.refine import Calibration
+from calib.refine import Calibration, CalibrationConfig
 from sfm.core.arrays import FloatArray, Points2D, Value, Vector, readonly
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -43,6 +54,11 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
 
 _ALIGNMENTS = 8
+_LEAST_FREEDOM = 1e-3
+"""Of a residual's direction, below which the fit has followed all of it."""
+_LEAST_SHARE = 0.8
+_MEDIAN_LENGTH = 1.17741
+"""Of a pair of unit normal numbers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -73,13 +89,16 @@ class CalibrationCovariance(Value):
         return dict(zip(self.names, np.sqrt(np.diag(self.shared)).tolist(), strict=True))
 
 
-def covariance(calibration: Calibration, *, by_view: bool = False) -> CalibrationCovariance | Rejected:
-    """Covariances at the solution.
+def covariance(
+    calibration: Calibration, *, by_view: bool = False, alike: bool = False
+) -> CalibrationCovariance | Rejected:
+    """Covariances at the solution, each corner as uncertain as its residual tells.
 
     Args:
         by_view: by leaving out each view in turn, which holds however residuals of one view are correlated; it needs
-            many more views than parameters to be accurate itself. Poses keep the covariance that takes all residuals
-            for independent.
+            many more views than parameters to be accurate itself.
+        alike: takes all corners for equally certain (by their covariances, where they came with any), as OpenCV does.
+            So does the covariance of poses, always.
     Returns:
         `undetermined_parameters` where the views leave a parameter open.
     """
@@ -88,7 +107,10 @@ def covariance(calibration: Calibration, *, by_view: bool = False) -> Calibratio
     if sigma is None:
         return Rejected("undetermined_parameters", "the views leave a combination of parameters open")
     variance = calibration.sigma_px**2
-    shared = _jackknife(parts) if by_view else variance * sigma
+    if by_view:
+        shared = _jackknife(parts)
+    else:
+        shared = variance * sigma if alike else _by_corner(calibration, parts, sigma)
     if shared is None:
         return Rejected("undetermined_parameters", "without one of the views a combination of parameters is open")
     solved = np.linalg.solve(parts.H, parts.W)
@@ -213,6 +235,49 @@ def _inverse(S: FloatArray) -> FloatArray | None:
     if not values[0] > 1e-15 * values[-1]:
         return None
     return (vectors / values) @ vectors.T / np.outer(root, root)
+
+
+def _by_corner(calibration: Calibration, parts: _Parts, sigma: FloatArray) -> FloatArray:
+    """HC2, view by view; with what rejection has hidden."""
+    observations, meat = calibration.observations, np.zeros_like(sigma)
+    for v, inverse in enumerate(np.linalg.inv(parts.H)):
+        rows = slice(observations.offsets[v], observations.offsets[v + 1])
+        by_pose, by_shared, residuals = _whitened_derivatives(calibration, v, rows)
+        D = by_shared - by_pose @ (inverse @ parts.W[v])
+        leverages = by_pose @ inverse @ by_pose.swapaxes(1, 2) + D @ sigma @ D.swapaxes(1, 2)
+        values, vectors = np.linalg.eigh(np.eye(2) - leverages)
+        roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
+        scores = np.einsum("nik,nij,nj->nk", D, roots, residuals)
+        meat += scores.T @ scores
+    return sigma @ meat @ sigma / _share_kept(calibration) ** 2
+
+
+def _whitened_derivatives(calibration: Calibration, v: int, rows: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of the corners of a view: (n, 2, 6) by its pose, (n, 2, K) by what views share, and (n, 2) residuals."""
+    observations, shape = calibration.observations, calibration.shape
+    pose = calibration.cams_from_board[v]
+    at = observations.rows[rows]
+    points = pose @ (observations.board[at] + shape.displacements[at])
+    _, by_point, by_params, _ = calibration.camera.project_with_jacobians(points)
+    by_pose = np.concatenate([-by_point @ skew(points), by_point], axis=2)
+    by_shared = by_params[:, :, calibration.columns]
+    if len(shape.coefficients):
+        by_shared = np.concatenate([by_shared, by_point @ pose.rotation.matrix @ shape.basis[at]], axis=2)
+    a, b, c = observations.roots[rows].T
+    roots = np.stack([np.stack([a, b], -1), np.stack([np.zeros_like(c), c], -1)], -2)
+    residuals = np.einsum("nij,nj->ni", roots, np.nan_to_num(calibration.residuals[rows]))
+    return np.nan_to_num(roots @ by_pose), np.nan_to_num(roots @ by_shared), residuals
+
+
+def _share_kept(calibration: Calibration) -> float:
+    """1 − ½ c ρ, with ρ from the lengths between 0.8 c and c; 1 where none was rejected."""
+    if not calibration.rejected_corners:
+        return 1.0
+    a, b, c = calibration.observations.roots.T
+    u, v = np.nan_to_num(calibration.residuals).T
+    lengths = np.hypot(a * u + b * v, c * v)
+    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
+    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
 
 
 def _jackknife(parts: _Parts) -> FloatArray | None:

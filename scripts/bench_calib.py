@@ -136,7 +136,7 @@ def beside(name: str, lens: str, board: np.ndarray, views: list[BoardView], repe
     row: dict[str, Any] = {"set": name, "lens": lens, "views": len(views), "opencv_ms": their_ms, "ours_ms": our_ms}
     row["times_faster"] = their_ms / our_ms
     if not isinstance(ours, Rejected) and lens != "fisheye":
-        row["ours_all_ms"] = our_ms + timed(lambda: covariance(ours), repeats)[1]
+        row["ours_all_ms"] = our_ms + timed(lambda: covariance(ours, alike=True), repeats)[1]
         theirs, row["opencv_all_ms"] = timed(lambda: opencv(lens, board, views, True), 1)
     if isinstance(ours, Rejected):
         row["ours"] = ours.detail
@@ -157,7 +157,7 @@ def beside(name: str, lens: str, board: np.ndarray, views: list[BoardView], repe
 
 
 def sigma_mismatch(found: Calibration, theirs: np.ndarray) -> float | None:
-    covariances = covariance(found)
+    covariances = covariance(found, alike=True)
     if isinstance(covariances, Rejected):
         return None
     ours = np.array(list(covariances.deviations.values()))

@@ -68,6 +68,10 @@ CASES = {
         camera=Camera("OPENCV_FISHEYE", 640, 480, np.array([192.0, 191.0, 318.0, 242.0, 0.01, -0.003, 0.001, 0.0])),
         lens="fisheye", board=_MARKED, bend=0.0005, reach=0.42, distance=(0.14, 0.22),
     ),
+    "fisheye120": Case(
+        camera=Camera("OPENCV_FISHEYE", 720, 400, np.array([330.0, 332.0, 352.0, 207.0, -0.02, 0.01, -0.004, 0.0])),
+        lens="fisheye", board=chessboard(8, 5, 0.025), bend=0.0, reach=0.25, distance=(0.17, 0.3),
+    ),
 }  # fmt: skip
 
 

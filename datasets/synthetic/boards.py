@@ -12,7 +12,8 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
 
 PARTS = 3
-"""Rays a pixel and axis."""
+"""Rays a pixel and axis. An edge along a row of pixels is off by up to a sixth of a pixel where texels are smaller than
+that: with five rays it would be a tenth, but take three times as long."""
 WHITE, BLACK = 0.82, 0.10
 SURROUND = 0.4
 

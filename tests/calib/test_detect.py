@@ -32,10 +32,10 @@ def distances(seen: Detection, truth: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("board", "camera", "distance", "blur", "noise", "worst_rms"),
     [
-        (CHESSBOARD, views.PINHOLE, 0.30, 0.7, 0.02, 0.03),
-        (CHESSBOARD, views.DISTORTED, 0.34, 1.5, 0.01, 0.03),
-        (CHESSBOARD, views.FISHEYE, 0.15, 0.5, 0.01, 0.03),
-        (CHARUCO, views.DISTORTED, 0.30, 0.7, 0.01, 0.05),
+        (CHESSBOARD, views.PINHOLE, 0.30, 0.7, 0.02, 0.015),
+        (CHESSBOARD, views.DISTORTED, 0.34, 1.5, 0.01, 0.015),
+        (CHESSBOARD, views.FISHEYE, 0.15, 0.5, 0.01, 0.015),
+        (CHARUCO, views.DISTORTED, 0.30, 0.7, 0.01, 0.02),
         (APRILGRID, views.FISHEYE, 0.14, 0.6, 0.01, 0.03),
         (CIRCLES, views.PINHOLE, 0.32, 0.7, 0.02, 0.03),
         (SHIFTED, views.DISTORTED, 0.30, 0.7, 0.02, 0.05),
@@ -56,7 +56,7 @@ def test_corners_are_unbiased_and_as_uncertain_as_they_say(board, camera, distan
     rms = np.sqrt(np.mean(off**2))
     assert rms < worst_rms
     assert np.abs(off.mean(axis=0)).max() < 5 * rms / np.sqrt(len(off)) + 0.003
-    assert np.abs(off).max() < 8 * rms
+    assert np.abs(off).max() < 10 * rms  # an edge along a row of pixels is rendered 0.07 px off
     assert 0.5 < squared.mean() / 2 < 2
 
 

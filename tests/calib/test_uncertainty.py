@@ -115,7 +115,88 @@ def test_deviations_are_those_of_opencv(rng):
         (1280, 960), np.eye(3), np.zeros(5), flags=0,
         criteria=(cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-12),
     )  # fmt: skip
-    np.testing.assert_allclose(list(covered(found).deviations.values()), theirs[5].ravel()[:9], rtol=1e-3)
+    deviations = list(covered(found, alike=True).deviations.values())
+    np.testing.assert_allclose(deviations, theirs[5].ravel()[:9], rtol=1e-3)
+
+
+def test_deviations_hold_where_corners_are_unlike():
+    """Corners at the border of the board, which say most of the camera, err three times as much as the others."""
+    rng = np.random.default_rng(11)
+    exact = seen(LENS, BOARD, poses_before(LENS, 10, rng), rng, 0.0)
+    outer = (BOARD[:, :2] == BOARD[:, :2].min(0)) | (BOARD[:, :2] == BOARD[:, :2].max(0))
+    noise = np.where(outer.any(axis=1), 0.15, 0.05)[:, None]
+    errors, by_corner, alike = [], [], []
+    for _ in range(100):
+        noisy = [with_corners(v, v.points2D + noise[v.corner_ids] * rng.normal(size=v.points2D.shape)) for v in exact]
+        found = calibrated(noisy)
+        errors.append(found.camera.params - LENS.params)
+        by_corner.append(np.diag(covered(found).shared))
+        alike.append(np.diag(covered(found, alike=True).shared))
+    true = np.mean(np.square(errors), axis=0)
+    # 100 trials know a deviation to 7 %.
+    assert np.mean(np.sqrt(np.mean(by_corner, axis=0) / true)) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(np.sqrt(np.mean(alike, axis=0) / np.mean(by_corner, axis=0))) < 0.9
+
+
+def test_scores_of_corners_are_those_of_the_whole_jacobian(rng):
+    """With a board that is bent, corners of unlike covariances, and all poses in one dense matrix."""
+    views = [
+        dataclasses.replace(
+            v, covariances=np.array([np.diag([0.01, 0.02]) * (1 + k % 3) for k in range(len(v.points2D))])
+        )
+        for v in seen(LENS, BOARD, poses_before(LENS, 6, rng), rng)
+    ]
+    found = calibrated(views, dataclasses.replace(CONFIG, shape="paraboloid"))
+    J, r = dense_jacobian(found)
+    inverse = np.linalg.inv(J.T @ J)
+    meat = np.zeros_like(inverse)
+    for n in range(len(r) // 2):
+        part = J[2 * n : 2 * n + 2]
+        values, vectors = np.linalg.eigh(np.eye(2) - part @ inverse @ part.T)
+        score = part.T @ (vectors / np.sqrt(values)) @ vectors.T @ r[2 * n : 2 * n + 2]
+        meat += np.outer(score, score)
+    count = len(covered(found).names)
+    expected = (inverse @ meat @ inverse)[:count, :count]
+    np.testing.assert_allclose(covered(found).shared, expected, rtol=1e-3, atol=1e-4 * np.sqrt(
+        np.outer(np.diag(expected), np.diag(expected))
+    ).max() * 1e-3)  # fmt: skip
+
+
+def dense_jacobian(found):
+    """Numeric derivatives of all whitened residuals by camera, shape and poses, and the residuals."""
+    shape, poses, observations = found.shape, found.cams_from_board, found.observations
+    a, b, c = observations.roots.T
+
+    def residuals(delta):
+        camera = found.camera.with_params(found.camera.params + delta[:8])
+        moved = dataclasses.replace(shape, coefficients=shape.coefficients + delta[8:-36])
+        board = observations.board + moved.displacements
+        out = []
+        for v, step in enumerate(delta[-36:].reshape(6, 6)):
+            at = observations.rows[observations.offsets[v] : observations.offsets[v + 1]]
+            out.append(camera.project((Rigid3.exp(step) @ poses[v]) @ board[at])[0])
+        du, dv = (np.concatenate(out) - observations.points2D).T
+        return np.column_stack([a * du + b * dv, c * dv]).ravel()
+
+    steps = np.concatenate(
+        [found.camera.params * 1e-6 + 1e-8, np.full(len(shape.coefficients), 1e-7), np.full(36, 1e-6)]
+    )
+    J = np.column_stack(
+        [(residuals(step) - residuals(-step)) / (2 * steps[k]) for k, step in enumerate(np.diag(steps))]
+    )
+    return J, residuals(np.zeros(len(steps)))
+
+
+def test_rejection_is_made_up_for(rng):
+    """Heavy tails, cut off: what is left looks more certain than it is."""
+    exact, errors, variances = seen(LENS, BOARD, poses_before(LENS, 8, rng), rng, 0.0), [], []
+    for _ in range(80):
+        noisy = [with_corners(v, v.points2D + 0.05 * rng.standard_t(3, v.points2D.shape)) for v in exact]
+        found = calibrated(noisy, dataclasses.replace(CONFIG, reject=True))
+        errors.append(found.camera.params - LENS.params)
+        variances.append(np.diag(covered(found).shared))
+    ratio = np.sqrt(np.mean(variances, axis=0) / np.mean(np.square(errors), axis=0))
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.12)
 
 
 def test_leaving_out_views_agrees_where_views_are_alike_and_many():
