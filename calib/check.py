@@ -14,15 +14,16 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from calib.board_turns import BoardTurn
 from calib.diagnose import Finding, diagnose_photos
 from calib.diagnose_window import stated_finding, window_finding
 from calib.refine import Calibration
 from calib.refine_board import BoardShape
-from calib.refine_reject import RejectedView
+from calib.refine_reject import RejectedView, without_copies
 from calib.refine_system import CalibrationSystem
 from calib.refine_views import BoardView, gather
 from calib.uncertainty import covariance
-from calib.uncertainty_holdout import fit_poses
+from calib.uncertainty_holdout import fit_poses, read_as_suits
 from sfm.core.arrays import Points3D, Value
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -79,6 +80,7 @@ class CameraCheck(Value):
 def check_camera(
     camera: Camera, shape: BoardShape, views: Sequence[BoardView], *, limit_px: float,
     sigmas: Mapping[str, float] | None = None, stated_px: float = math.nan, is_ours: bool = False,
+    turns: Sequence[BoardTurn] = (),
 ) -> CameraCheck | Rejected:  # fmt: skip
     """Compares photos of a board with a camera.
 
@@ -88,11 +90,12 @@ def check_camera(
         limit_px: rms error that is allowed.
         sigmas: standard deviations of the camera's parameters, where they are known.
         stated_px, is_ours: rms error of the corners that it was calibrated with, and whether they were found here.
+        turns: of the board that nothing printed on it tells apart; a view is read from the end that suits it best.
     Returns:
         `no_views` where none can be used, with the reason of the first.
     """
     usable, left_out = _sorted_out(camera, views)
-    observations = gather(shape.given, usable)
+    observations, _ = read_as_suits(camera, shape, gather(shape.given, usable), turns)
     system, seen = fit_poses(camera, shape, observations)
     left_out += [
         RejectedView(view.name, "no_pose", "its corners are not seen by this camera from anywhere")
@@ -128,7 +131,8 @@ def _perhaps_of_corners(finding: Finding) -> Finding:
 
 
 def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
-    usable, left_out = [], []
+    views, left_out = without_copies(views)
+    usable = []
     for view in views:
         if (view.width, view.height) != (camera.width, camera.height):
             detail = f"{view.width}x{view.height}, the camera has {camera.width}x{camera.height}"

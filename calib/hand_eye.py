@@ -21,6 +21,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from jaxtyping import Float64
 
+from calib.board_turns import BoardTurn, turn_of
 from calib.hand_eye_robot import HandEyeViews, balanced, pose_information, worst_view
 from calib.hand_eye_start import closed_form, consistent_turns, motions_agree, same_unit, turned_enough
 from calib.hand_eye_system import HandEyeEstimate, HandEyeSystem
@@ -28,7 +29,6 @@ from calib.refine_fit import CalibrationConfig
 from calib.refine_reject import RejectedView
 from calib.refine_views import BoardView
 from calib.rig_alone import AloneCamera, camera_alone
-from calib.rig_poses import BoardTurn, turn_of
 from calib.rig_views import RigCamera
 from sfm.core.arrays import FloatArray, Points3D, Value, Vector
 from sfm.core.cameras import Camera

@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 
-from calib.rig_poses import BoardTurn
+from calib.board_turns import BoardTurn
 from sfm.core.arrays import FloatArray, Vector
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3

@@ -1,6 +1,7 @@
 """Calibration of one camera from photos of a board: from corners to a camera, poses, the board's shape, and doubts.
 
-    sort out views → start (`zhang`) → release parameters in stages, on some views → all views → reject → verdict
+    sort out views → start (`zhang`) → read all from one end (`refine_turns`) → release parameters in stages, on some
+    views → all views → reject → verdict
 
 What is rejected is told with its reason. Where the views leave the principal point open it is held at the centre of the
 image, and where they leave the focal length open there is no camera: `Rejected`.
@@ -21,6 +22,7 @@ from calib.refine_fit import CalibrationConfig, Fit, solve_from_start, turned_ba
 from calib.refine_lenses import lens_by_name
 from calib.refine_reject import RejectedView, reject_outliers, sort_out
 from calib.refine_system import CalibrationSystem, Estimate
+from calib.refine_turns import read_alike
 from calib.refine_views import BoardView, Observations
 from calib.zhang import find_start
 from sfm.core.arrays import Points3D, Value, Vector
@@ -49,6 +51,8 @@ class Calibration(Value):
         converged: another step, undamped, promises less than a billionth of the cost. It is False where the solution is
             held back by `keep_invertible`: the lens model has more coefficients than the photos can bear.
         keep_invertible: as it was calibrated; see `CalibrationConfig`.
+        turned_views: that read the board from another end than they were given with; see `refine_turns`. Rows of
+            `observations` and of `rejected_corners` are those of the end that all read it from.
     """
 
     lens: str
@@ -68,6 +72,7 @@ class Calibration(Value):
     iterations: int
     cost: float
     keep_invertible: bool = True
+    turned_views: tuple[str, ...] = ()
 
     @property
     def estimate(self) -> Estimate:
@@ -117,9 +122,11 @@ def calibrate(
     start = find_start(observations, homographies, lens, config.focal_px)
     if isinstance(start, Rejected):
         return start
-    shown = np.bincount(observations.rows, minlength=len(board))
-    shape = board_shape(config.shape, observations.board, shown >= 2)
-    fit = Fit(lens, config, start, shape)
+    fit = Fit(lens, config, start, _shape(observations, config))
+    # In what is taken from homographies a turn of the board in its plane changes nothing.
+    alike = read_alike(fit, observations, homographies)
+    turned_views = _renamed(observations, alike)
+    observations, fit = alike, dataclasses.replace(fit, shape=_shape(alike, config))
     solved = solve_from_start(fit, observations, homographies)
     if isinstance(solved, Rejected):
         return solved
@@ -142,7 +149,20 @@ def calibrate(
             f"focal lengths were tried for a start, since {start.detail or 'the closed form failed'}",
             *fallbacks,
         )
-    return _result(fit, system, summary, columns, rejected, corners, fallbacks)
+    found = _result(fit, system, summary, columns, rejected, corners, fallbacks)
+    return dataclasses.replace(found, turned_views=tuple(n for n in turned_views if n in found.observations.names))
+
+
+def _shape(observations: Observations, config: CalibrationConfig) -> BoardShape:
+    """The undeformed board of the family that was asked for; points that fewer than two views show do not move."""
+    shown = np.bincount(observations.rows, minlength=len(observations.board))
+    return board_shape(config.shape, observations.board, shown >= 2)
+
+
+def _renamed(before: Observations, after: Observations) -> list[str]:
+    """Views whose corners are other ones now."""
+    changed = np.bincount(before.view_of, before.rows != after.rows, len(before))
+    return [name for name, count in zip(before.names, changed, strict=True) if count]
 
 
 def _told(count: int, needed: int, rejected: Sequence[RejectedView]) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from calib.board_turns import BoardTurn
 from calib.refine_board import BoardShape, ShapeKind
 from calib.refine_lenses import Lens
 from calib.refine_system import CalibrationSystem, Estimate
@@ -44,6 +45,8 @@ class CalibrationConfig:
     """Row of `refine_lenses.LENSES`."""
     shape: ShapeKind = "flat"
     """What the board may be; see `refine_board`."""
+    turns: tuple[BoardTurn, ...] = ()
+    """Of the board that nothing printed on it tells apart, the first is none; see `board_turns.board_turns`."""
     focal_px: float | None = None
     """First guess where it is known; it is refined."""
     reject: bool = True

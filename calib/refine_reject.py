@@ -40,13 +40,31 @@ class RejectedView:
     detail: str = ""
 
 
+def without_copies(views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
+    """A photo that is there twice would count twice: the first one stays, the others are `copy_of` it."""
+    first: dict[bytes, str] = {}
+    kept, copies = [], []
+    for view in views:
+        key = view.corner_ids.tobytes() + view.points2D.tobytes()
+        if key in first:
+            copies.append(RejectedView(view.name, f"copy_of {first[key]}", "the same corners to the last bit"))
+        else:
+            first[key] = view.name
+            kept.append(view)
+    return kept, copies
+
+
 def sort_out(
     board: FloatArray, views: Sequence[BoardView], config: CalibrationConfig
 ) -> tuple[Observations, Homographies, list[RejectedView]]:
-    """Views that can be used, and the others: another size, too few corners, corners on a line or in a wrong order."""
+    """Views that can be used, and the others.
+
+    These are copies, of another size, or have too few corners, corners on a line or in a wrong order.
+    """
+    views, rejected = without_copies(views)
     sizes = [(view.width, view.height) for view in views]
     common = max(sorted(set(sizes)), key=sizes.count) if sizes else (0, 0)
-    usable, rejected = [], []
+    usable = []
     for view, size in zip(views, sizes, strict=True):
         if size != common:
             detail = f"{size[0]}x{size[1]} among photos of {common[0]}x{common[1]}"

@@ -15,10 +15,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.board_turns import BoardTurn, turn_of
 from calib.refine_reject import RejectedView
 from calib.rig_alone import AloneCamera, camera_alone, shape_of
 from calib.rig_estimate import RigEstimate
-from calib.rig_poses import BoardTurn, CameraFrames, FirstPoses, first_poses, turn_of
+from calib.rig_poses import CameraFrames, FirstPoses, first_poses
 from calib.rig_reject import RigFit, reject_from_rig
 from calib.rig_result import RigCalibration, RigConfig
 from calib.rig_system import RigSystem

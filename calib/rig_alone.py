@@ -64,7 +64,7 @@ def camera_alone(
     """
     if not seen.views:
         return Rejected("camera_without_board", f"{seen.name} sees the board in none of its photos")
-    views, twice = _without_copies(seen.views)
+    views = list(seen.views)
     frame_of = dict(zip((view.name for view in seen.views), seen.frames, strict=True))
     found = _known(board, seen, views, config) if seen.camera is not None else _new(board, seen, views, config)
     if isinstance(found, Rejected):
@@ -75,22 +75,7 @@ def camera_alone(
         found,
         frames=tuple(frame_of[name] for name in names),
         columns=found.columns if keep_columns else _POSES_ONLY,
-        rejected=(*twice, *found.rejected),
     )
-
-
-def _without_copies(views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
-    """A photo that is there twice would count twice."""
-    first: dict[bytes, str] = {}
-    kept, copies = [], []
-    for view in views:
-        key = view.corner_ids.tobytes() + view.points2D.tobytes()
-        if key in first:
-            copies.append(RejectedView(view.name, "copy", f"the same corners as in {first[key]}"))
-        else:
-            first[key] = view.name
-            kept.append(view)
-    return kept, copies
 
 
 def _new(board: Points3D, seen: RigCamera, views: list[BoardView], config: CalibrationConfig) -> AloneCamera | Rejected:

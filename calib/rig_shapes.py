@@ -13,9 +13,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.board_turns import BoardTurn
 from calib.refine_board import ShapeKind
 from calib.rig import RigCalibration, RigConfig, calibrate_rig
-from calib.rig_poses import BoardTurn
 from calib.rig_uncertainty import RigHeldOut, hold_out_frames
 from calib.rig_views import RigCamera
 from calib.uncertainty_choice import GENERALISES, generalises, is_clearly_lower, photos_needed, what_it_brings

@@ -26,10 +26,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.board_turns import BoardTurn
 from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_board import BoardShape
 from calib.refine_lenses import lens_by_name
 from calib.refine_system import CalibrationSystem, Estimate
+from calib.refine_turns import read_after, turns_matter
 from calib.refine_views import BoardView, Observations
 from calib.uncertainty import pixel_grid, projection_difference
 from calib.uncertainty_choice import generalises, is_clearly_lower, photos_needed, what_it_brings
@@ -40,6 +42,8 @@ from sfm.core.errors import Rejected
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
 _POSES = StopRules(max_iterations=50, relative_cost_tolerance=1e-10, gradient_tolerance=0.0)
+_GAIN = 1 - 1e-6
+"""Of an error that is less than another by more than rounding."""
 _CLEAR = 1.0
 """Standard errors by which a richer lens model has to be better."""
 CANDIDATES = ("pinhole", "simple_radial", "radial", "opencv4", "opencv5", "opencv8", "fisheye", "eucm")
@@ -89,7 +93,7 @@ def hold_out(
         if isinstance(fit, Rejected):
             return fit
         trained.append(fit.rms_px)
-        squares[held] = pose_only_errors(fit, found.observations.of_views(held))
+        squares[held] = pose_only_errors(fit, found.observations.of_views(held), config.turns)
     return HeldOut(
         names=found.observations.names,
         squares=squares,
@@ -98,9 +102,34 @@ def hold_out(
     )
 
 
-def pose_only_errors(found: Calibration, observations: Observations) -> Vector:
-    """(V,) mean squared length of residuals in px² with this camera and board, each view's pose fitted to it."""
-    system, seen = fit_poses(found.camera, found.shape, observations)
+def pose_only_errors(found: Calibration, observations: Observations, turns: Sequence[BoardTurn] = ()) -> Vector:
+    """(V,) mean squared length of residuals in px² with this camera and board, each view's pose fitted to it.
+
+    Args:
+        turns: of the board that nothing printed on it tells apart; a view is read after the one that suits it best.
+    """
+    if not turns_matter(found.shape, turns):
+        turns = ()
+    return read_as_suits(found.camera, found.shape, observations, turns)[1]
+
+
+def read_as_suits(
+    camera: Camera, shape: BoardShape, observations: Observations, turns: Sequence[BoardTurn]
+) -> tuple[Observations, Vector]:
+    """Each view after the turn by which its error is least, and these errors, as `pose_only_errors` gives them.
+
+    Views stay as they are where a turn gains nothing.
+    """
+    best, least = np.zeros(len(observations), np.int64), _errors(camera, shape, observations)
+    for g in range(1, len(turns)):
+        tried = _errors(camera, shape, read_after(observations, np.full(len(best), g), turns))
+        better = tried < _GAIN * least
+        best[better], least[better] = g, tried[better]
+    return read_after(observations, best, turns), least
+
+
+def _errors(camera: Camera, shape: BoardShape, observations: Observations) -> Vector:
+    system, seen = fit_poses(camera, shape, observations)
     out = np.full(len(observations), np.inf)
     if not seen:
         return out

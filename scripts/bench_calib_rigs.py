@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from calib import boards
+from calib.board_turns import board_turns
 from calib.hand_eye import calibrate_hand_eye
 from calib.hand_eye_start import closed_form, pairs_of
 from calib.refine_fit import CalibrationConfig
@@ -34,7 +35,6 @@ from calib.refine_views import BoardView
 from calib.rig import RigCalibration, RigConfig, calibrate_rig
 from calib.rig_alone import camera_alone
 from calib.rig_epipolar import epipolar_errors
-from calib.rig_poses import board_turns
 from calib.rig_system import RigSystem
 from calib.rig_uncertainty import hold_out_frames, relative_uncertainty, rig_covariance
 from calib.rig_views import RigCamera, RigObservations

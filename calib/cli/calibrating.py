@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
@@ -218,7 +219,8 @@ def calibrate_camera(
         why there is none; see `calibrate` and `choose_lens`.
     """
     observer(StageStarted(stage=STAGE))
-    config = plan.config
+    turns = board_turns(seen.board) if seen.board is not None else ()
+    config = dataclasses.replace(plan.config, turns=turns)
     lenses: tuple[RankedLens, ...] = ()
     shapes: tuple[RankedShape, ...] = ()
     if plan.lens == AUTO:

@@ -88,7 +88,7 @@ def main(words: Sequence[str]) -> int:
     from calib.cli.camera_report import camera_json, camera_lines, record_of
     from calib.cli.next_photos import drawn, next_photos
     from calib.cli.progress import kernels_announced, told
-    from calib.cli.refusals import no_camera
+    from calib.cli.refusals import no_camera, shown_size
     from sfm.io.atomic import write_text
     from sfm.io.camera_files import write_camera_toml
 
@@ -98,9 +98,12 @@ def main(words: Sequence[str]) -> int:
             options.images, board, size=size, threads=options.threads, use_cache=not options.no_cache,
             observer=observer,
         )  # fmt: skip
+        finding = shown_size(seen, options.images)
         made = calibrate_camera(seen, _plan(options), observer=observer) if seen.views else Rejected("no_board")
     if isinstance(made, Rejected):
         raise no_camera(seen, made, options.images)
+    if finding is not None:
+        made = dataclasses.replace(made, findings=(finding, *made.findings))
     record = record_of(made, seen, command=shlex.join(["calib", "camera", *words]))
     write_camera_toml(options.output, made.found.camera, name=options.name, record=record)
     suggested = next_photos(made, seen)

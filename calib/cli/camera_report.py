@@ -89,6 +89,7 @@ def camera_json(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Sug
         "would_bring": list(made.would_bring),
         seen.kind: {"count": seen.count, "digest": seen.digest},
         "views": _views(found),
+        "turned_views": list(found.turned_views),
         "rejected": [dataclasses.asdict(view) for view in made.left_out],
         "findings": [dataclasses.asdict(finding) for finding in made.findings],
         "suggestions": suggestions_json(suggested),
@@ -162,6 +163,8 @@ def _board_lines(made: CalibratedCamera) -> Iterator[str]:
             f"  corners lie {1000 * board['displacement_rms_m']:.3g} mm (rms) from their design, "
             f"{1000 * board['bend_m']:.3g} mm from the lowest to the highest"
         )
+    if found.turned_views:
+        yield f"  read from the other end, as the others: {', '.join(found.turned_views)}"
     for row in made.shapes:
         why = f"  not taken{'' if row.would_bring else f': {row.refused}'}" if row.refused else ""
         yield f"  {row.kind:<12}held-out {_px(row.held_out_rms_px)} px{why}"

@@ -60,14 +60,14 @@ def check_apart(folder: Path, sources: Sequence[Path]) -> None:
         raise ConfigError(cause, path=folder, remedy="name a folder elsewhere")
 
 
-def photos_of(sources: Sequence[Path], names: Sequence[str]) -> dict[str, ImageU8]:
-    """The photos of some names, as they are; those that are not there or cannot be read are left out."""
+def photos_of(sources: Sequence[Path], names: Sequence[str], *, gray: bool = False) -> dict[str, ImageU8]:
+    """The photos of some names, as they are, or grey; those that are not there or cannot be read are left out."""
     out = {}
     with contextlib.suppress(InputError):
         photos = find_photos(sources)
         for name in names:
             with contextlib.suppress(KeyError, ImageError):
-                out[name] = read_image(photos[name])
+                out[name] = read_image(photos[name], gray=gray)
     return out
 
 

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from calib.board_extent import size_that_is_shown
 from calib.cli.calibrating import Sightings
 from calib.cli.other_boards import board_that_is_shown
-from calib.cli.photos import find_photos
+from calib.cli.photos import find_photos, photos_of
+from calib.diagnose import Finding
 from sfm.core.errors import InputError, ReconstructionError, Rejected, SfmError
 
 _NAMED = 3
+_LOOKED_AT = 8
+"""Photos in which the board's size is made sure of."""
 COUNTED = {
     "chessboard": "inner corners", "charuco": "squares", "aprilgrid": "tags", "circles": "circles",
     "acircles": "circles",
@@ -50,6 +55,31 @@ def no_board(seen: Sightings, sources: Sequence[Path]) -> SfmError:
         f"none of {seen.count} {seen.kind} shows {spec} ({_counted(seen)})",
         path=path,
         remedy=_check_the_board(seen, sources),
+    )
+
+
+def shown_size(seen: Sightings, sources: Sequence[Path]) -> Finding | None:
+    """What is to be said if the photos show a chessboard of another size than the one that was found in them.
+
+    Raises:
+        InputError: that is certain.
+    """
+    if seen.board is None or seen.board.kind != "chessboard" or seen.kind != "photos":
+        return None
+    some = seen.views[:: max(1, len(seen.views) // _LOOKED_AT)]
+    photos, views = photos_of(sources, [view.name for view in some], gray=True), {view.name: view for view in some}
+    shown = size_that_is_shown(seen.board, [(photo, views[name]) for name, photo in photos.items()])
+    if shown is None:
+        return None
+    named = f"{seen.board.columns}x{seen.board.rows}"
+    told = (
+        f"{shown.count} of {shown.total} photos show a board of {shown.columns}x{shown.rows} inner corners, not {named}"
+    )
+    other = dataclasses.replace(seen.board, columns=shown.columns, rows=shown.rows)
+    if shown.is_certain:
+        raise InputError(told, path=sources[0] if len(sources) == 1 else None, remedy=f"try --board {other.spec}")
+    return Finding(
+        "other_board", told, f"look at the corners with `calib detect --overlays`, or try --board {other.spec}"
     )
 
 

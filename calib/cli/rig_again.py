@@ -10,6 +10,7 @@ from typing import cast
 
 import numpy as np
 
+from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.again import SAME_PX, difference_px
 from calib.cli.calibrating import Sightings
@@ -20,7 +21,6 @@ from calib.cli.rigging import lens_of, rig_refused, see_rig
 from calib.refine_board import SHAPES, ShapeKind
 from calib.refine_lenses import lens_called
 from calib.rig_frames import PAIRINGS, FrameTable, Pairing
-from calib.rig_poses import board_turns
 from calib.rig_result import RigCalibration, RigConfig
 from calib.rig_shapes import RankedRig, choose_rig_shape
 from calib.rig_views import RigCamera

@@ -31,9 +31,9 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
     """Photos of the cameras in `sources`, by name a folder or pattern each, to a rig file and a report on stdout."""
     board, files = checked(options, sources)
 
+    from calib.board_turns import board_turns
     from calib.cli.progress import kernels_announced, told
     from calib.cli.rig_report import rig_json, rig_lines, rig_record
-    from calib.rig_poses import board_turns
     from sfm.io.rig_files import write_rig_file
 
     observer = told()

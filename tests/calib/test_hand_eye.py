@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib.board_turns import board_turns
 from calib.boards import chessboard
 from calib.hand_eye import HandEyeCalibration, HandEyeConfig, calibrate_hand_eye
 from calib.hand_eye_start import axis_spread, closed_form
 from calib.hand_eye_system import HandEyeEstimate, HandEyeSystem
 from calib.refine_views import BoardView, gather
-from calib.rig_poses import board_turns
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3

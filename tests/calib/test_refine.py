@@ -468,3 +468,23 @@ def test_a_view_that_is_tilted_the_wrong_way_is_turned_back(rng):
     assert turned is not None
     np.testing.assert_allclose(turned.rotations, found.estimate.rotations, atol=1e-3)
     np.testing.assert_allclose(turned.translations, found.estimate.translations, atol=1e-4)
+
+
+def test_copies_of_a_photo_count_once_and_are_named(rng):
+    views = views_of(LENS, rng)
+    copies = [dataclasses.replace(views[k], name=f"copy{k}") for k in (3, 3, 5)]
+    copies[1] = dataclasses.replace(copies[1], name="again3")
+    found = calibrated([*copies[:1], *views, *copies[1:]])
+    plain = calibrated(views)
+    assert found.cost == pytest.approx(plain.cost, rel=1e-12)
+    assert [(view.name, view.reason) for view in found.rejected_views] == [
+        ("view03", "copy_of copy3"), ("again3", "copy_of copy3"), ("copy5", "copy_of view05"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(found.camera.params, plain.camera.params, rtol=1e-6)
+
+
+def test_eight_copies_of_one_photo_are_one_photo(rng):
+    view = views_of(LENS, rng)[0]
+    why = refused([dataclasses.replace(view, name=f"{k}") for k in range(8)])
+    assert why.reason == "too_few_views"
+    assert why.detail.startswith("1 of 3 needed (1: copy_of 0")

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from calib.board_turns import board_turns
 from calib.boards import chessboard
 from calib.refine_views import BoardView
 from calib.rig import RigCalibration, RigConfig, calibrate_rig
 from calib.rig_epipolar import distances_from_curves, epipolar_errors
-from calib.rig_poses import board_turns
 from calib.rig_shapes import choose_rig_shape
 from calib.rig_views import RigCamera
 from sfm.core.errors import Rejected
@@ -267,7 +267,7 @@ def test_a_photo_that_is_there_twice_counts_once(rng):
     copy = dataclasses.replace(one.views[0], name="copy")
     twice = dataclasses.replace(one, views=(*one.views, copy), frames=(*one.frames, "99"))
     found = calibrated([twice, two])
-    assert [(view.name, view.reason) for view in found.rejected_views[0]] == [("copy", "copy")]
+    assert [(view.name, view.reason) for view in found.rejected_views[0]] == [("copy", f"copy_of {one.views[0].name}")]
     assert found.cost == calibrated([one, two]).cost
 
 
