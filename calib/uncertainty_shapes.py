@@ -197,12 +197,16 @@ def _why_not(row: RankedShape, simpler: RankedShape) -> tuple[str, str] | None:
 
 
 def _told(row: RankedShape, chosen: RankedShape, why: tuple[str, str] | None) -> RankedShape:
-    if why is None:
+    """What stands beside a shape: why it was not taken, if it predicts better than the one that was.
+
+    It may have been barred beside a simpler shape, and predict worse than the one that was taken in the end.
+    """
+    if row.held is None or row.kind == chosen.kind or not row.held_out_rms_px < chosen.held_out_rms_px:
         return row
+    if why is None or not is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
+        return dataclasses.replace(row, refused="not clearly better")
     errors = chosen.held_out_rms_px, row.held_out_rms_px
-    brings = ""
-    if is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
-        brings = what_it_brings(f"{NAMES[row.kind]} board shape", errors, *why, f"--shape {row.kind}")
+    brings = what_it_brings(f"{NAMES[row.kind]} board shape", errors, *why, f"--shape {row.kind}")
     return dataclasses.replace(row, refused=why[0], would_bring=brings)
 
 

@@ -20,6 +20,7 @@ from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
+from calib.cli.tried import with_what_was_tried
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
 from calib.diagnose_window import window_finding
@@ -255,7 +256,9 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view),
+        findings=with_what_was_tried(
+            _findings(seen, found, plain if isinstance(by_view, Rejected) else by_view), lenses, shapes
+        ),
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
