@@ -1,6 +1,6 @@
 """Calibration of one camera from photos of a board: from corners to a camera, poses, the board's shape, and doubts.
 
-    sort out views → start (`zhang`) → read all from one end (`refine_turns`) → release parameters in stages, on some
+    sort out views → start (`zhang`) → read all from one end (`refine_turns`) → release parameters, at first on some
     views → all views → reject → verdict
 
 What is rejected is told with its reason. Where the views leave the principal point open it is held at the centre of the

@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm.bundle.gauge import held_by_three_points, held_by_two_cameras, put_back, put_back_by_points
 from sfm.bundle.layout import lay_out
+from sfm.bundle.limits import MOST
 from sfm.bundle.problem import BundleConfig, BundleProblem, BundleResult
 from sfm.bundle.solver_plan import SolverPlan
 from sfm.bundle.system import BundleSystem
@@ -150,7 +151,7 @@ def _wider_scales(problem: BundleProblem, config: BundleConfig) -> list[float]:
     squared = squared_errors(problem) / sigmas**2
     worst = math.sqrt(float(squared[np.isfinite(squared)].max(initial=0.0)))
     halvings = min(max(math.ceil(math.log2(max(worst / config.loss_scale_px, 1.0))), 0), _MAX_HALVINGS)
-    return [config.loss_scale_px * 2.0**k for k in range(halvings, 0, -1)]
+    return [min(config.loss_scale_px * 2.0**k, MOST) for k in range(halvings, 0, -1)]
 
 
 def _moved(problem: BundleProblem, system: BundleSystem) -> BundleProblem:

@@ -15,7 +15,7 @@ is left,
     Σ = (1 − Q Qᵀ) S⁻ (1 − Q Qᵀ)
 
 is of all these covariances the one with the smallest sum of its diagonal. Motions that constant poses or points forbid
-do not count.
+do not count. Where a bias of positions is all that holds the scene, see `drift`.
 
 References:
     Triggs et al., Bundle adjustment — a modern synthesis, 2000, §9 (gauge freedom).
@@ -31,12 +31,14 @@ from jaxtyping import Float64
 
 from sfm.bundle import _covariance_kernels as kernels
 from sfm.bundle.adjustment import system_of
+from sfm.bundle.drift import drift_of
 from sfm.bundle.gauge import frame_centers, held_by_three_points
 from sfm.bundle.knowledge import Knowledge, motions_seen
 from sfm.bundle.layout import Layout, lay_out
 from sfm.bundle.marginals import Marginals
 from sfm.bundle.problem import BundleConfig, BundleProblem
 from sfm.bundle.solver_plan import plan_solver
+from sfm.bundle.system import system_bytes
 from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.errors import Rejected
@@ -59,7 +61,8 @@ class BundleCovariance(Value):
         params: (C, K, K) of the camera parameters; zero where they are constant or on a bound, which holds them.
         points3D: (P, 3, 3); zero where a point is constant, NaN where its views do not determine it.
         variance_factor: twice the cost over the degrees of freedom. Where the stated standard deviations are only
-            proportional to the true ones, all covariances times this are right; see `scaled`.
+            proportional to the true ones, all covariances times this are right; see `scaled`. NaN where nothing is left
+            over: no more residuals and priors than parameters.
     """
 
     poses: Float64[np.ndarray, "I 6 6"]
@@ -73,29 +76,53 @@ class BundleCovariance(Value):
             object.__setattr__(self, name, readonly(getattr(self, name), (None, None, None), np.float64))
 
     def scaled(self, factor: float | None = None) -> BundleCovariance:
-        """All covariances times `factor`, by default the variance factor; its own is then divided by it."""
+        """All covariances times `factor`, by default the variance factor; its own is then divided by it.
+
+        Right where residuals are all that is weighed: what priors state is not in proportion to them.
+
+        Raises:
+            ValueError: the factor is not positive and finite.
+        """
         by = self.variance_factor if factor is None else factor
+        if not 0 < by < np.inf:
+            raise ValueError(f"the factor must be positive and finite, got {by}")
         scaled = {name: getattr(self, name) * by for name in ("poses", "centers", "params", "points3D")}
         return dataclasses.replace(self, **scaled, variance_factor=self.variance_factor / by)
 
 
 def covariance(
-    problem: BundleProblem, config: BundleConfig = BundleConfig(), *, threads: int = 1
+    problem: BundleProblem,
+    config: BundleConfig = BundleConfig(),
+    *,
+    biases: Float64[np.ndarray, "G 3"] | None = None,
+    threads: int = 1,
 ) -> BundleCovariance | Rejected:
     """Covariances at the parameters of `problem`, which should be a minimum: the `problem` of a `BundleResult`.
 
     Takes a few times the time of a step of the adjustment with a factor, and memory as `covariance_bytes` says.
 
+    Args:
+        biases: those of position priors, as in a `BundleResult`; 0 without.
+
     Returns:
-        `undetermined_pose`, `undetermined_camera` or `undetermined_sensor`, with the row of what the observations leave
-        open as detail.
+        `undetermined_pose`, `undetermined_camera`, `undetermined_sensor` or `undetermined_bias`, with the row of what
+        the observations leave open as detail.
     """
     problem = dataclasses.replace(problem, free_params=problem.free_params & ~problem.at_bounds)
     system, _ = system_of(problem, _with_factor(config), threads)
+    motions = _open_motions(problem, system.layout, config)
+    drift = None
+    if len(system.biases):
+        system.biases[:] = 0.0 if biases is None else biases
+        drift = drift_of(problem, system) if not motions.shape[1] else None
+    if drift is not None:
+        problem = drift.problem
+        del system  # its memory is that of the next
+        system, _ = system_of(problem, _with_factor(config), threads)
+        motions = motions[: 6 * system.layout.rows]
     layout, (cost, _) = system.layout, system.linearize()
     held = held_by_three_points(problem, layout) if config.gauge == "three_points" else None
     known = system.information(held)
-    motions = _motions(problem, layout) if config.gauge == "free" else np.zeros((6 * layout.rows, 0))
     sigma = system.inverse(motions)
     if isinstance(sigma, int):
         return _undetermined(sigma, problem, layout)
@@ -110,6 +137,12 @@ def covariance(
     freedom = 2 * len(layout.image) + system.prior_count - system.free_count + motions.shape[1]
     freedom += sum(3 - basis.shape[1] for basis in held.bases) if held is not None else 0
     poses, centers = _pose_blocks(problem, layout, sigma)
+    if drift is not None:
+        cost += drift.cost
+        moving = layout.image_slot >= 0
+        poses[moving, 3:, 3:] += drift.variance * np.eye(3)
+        centers[moving] += drift.variance * np.eye(3)
+        points[problem.free_points] += drift.variance * np.eye(3)
     return BundleCovariance(
         poses=poses,
         centers=centers,
@@ -120,18 +153,26 @@ def covariance(
 
 
 def covariance_bytes(problem: BundleProblem, config: BundleConfig = BundleConfig()) -> int:
-    """About the memory that `covariance` takes, without taking it."""
+    """About the memory that `covariance` takes, without taking more of it than the layout of the problem."""
     layout = lay_out(problem, np.ones(len(problem.obs_images), bool))
     plan = plan_solver(layout, layout.padding, Knowledge(problem, layout).targets, _with_factor(config).solver)
+    system = system_bytes(layout, plan, len(problem.image_cameras), len(problem.points3D))
     blocks = 8 * BLOCK * BLOCK * len(plan.pattern.columns)
-    # Dense, the factor once more as a square, and its inverse.
-    square = 16 * int(np.sum(~layout.padding)) ** 2 if plan.forecast.kind == "dense" else 0
-    return plan.bytes + 3 * blocks + square + 200 * len(layout.image) + 300 * len(problem.points3D)
+    # The factor once more as a square, and its inverse; of a sparse one, those of its widest front and products.
+    square = 16 * int(np.sum(~layout.padding)) ** 2
+    if plan.forecast.fronts is not None:
+        square = 40 * int((plan.forecast.fronts.pivots + plan.forecast.fronts.rests).max(initial=0)) ** 2
+    return system + 3 * blocks + square + 72 * len(problem.points3D)
 
 
 def _with_factor(config: BundleConfig) -> BundleConfig:
     """The same with a solver that has a factor."""
     return config if config.solver in ("dense", "sparse") else dataclasses.replace(config, solver="exact")
+
+
+def _open_motions(problem: BundleProblem, layout: Layout, config: BundleConfig) -> FloatArray:
+    """Columns (6 rows, m) of the motions of the whole scene over which the covariance is spread."""
+    return _motions(problem, layout) if config.gauge == "free" else np.zeros((6 * layout.rows, 0))
 
 
 def _motions(problem: BundleProblem, layout: Layout) -> FloatArray:
@@ -221,4 +262,6 @@ def _undetermined(entry: int, problem: BundleProblem, layout: Layout) -> Rejecte
     shared = row - len(layout.slot_frame)
     if layout.shared.camera[shared] >= 0:
         return Rejected("undetermined_camera", str(layout.shared.camera[shared]))
-    return Rejected("undetermined_sensor", str(layout.shared.sensor[shared]))
+    if layout.shared.sensor[shared] >= 0:
+        return Rejected("undetermined_sensor", str(layout.shared.sensor[shared]))
+    return Rejected("undetermined_bias", str(layout.shared.bias[shared]))

@@ -27,11 +27,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import numpy as np
 
 from sfm.bundle import _motion_only_kernels as kernels
+from sfm.bundle.limits import check_scale, check_tolerance
 from sfm.bundle.motion_problem import MotionProblem, held_by_parts, with_baselines
 from sfm.core.arrays import FloatArray, Value
 from sfm.core.execution import chunk_bounds, ordered_map
@@ -65,10 +65,11 @@ class MotionConfig:
 
     def __post_init__(self) -> None:
         loss_id(self.loss)
-        if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
-            raise ValueError(f"loss_scale_px must be positive and finite, like its square, got {self.loss_scale_px}")
+        check_scale("loss_scale_px", self.loss_scale_px)
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_tolerance("relative_cost_tolerance", self.relative_cost_tolerance)
+        check_tolerance("gradient_tolerance", self.gradient_tolerance)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

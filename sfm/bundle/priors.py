@@ -14,6 +14,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 from jaxtyping import Float64, Int32
 
+from sfm.bundle.limits import check_scale
 from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
 from sfm.core.optim.losses import Loss, loss_id
 
@@ -51,7 +52,7 @@ class PositionPrior(Value):
     def __post_init__(self) -> None:
         _set_checked_positions(self, "images")
         if self.bias_sigma is not None:
-            _check_positive("bias_sigma", self.bias_sigma)
+            check_scale("bias_sigma", self.bias_sigma)
 
     @staticmethod
     def of_sigmas(
@@ -90,7 +91,7 @@ class GravityPrior(Value):
         _set(self, "directions_in_camera", (count, 3))
         _set(self, "sigmas_rad", (count,))
         _set(self, "down", (3,))
-        _check_positive("sigmas_rad", self.sigmas_rad)
+        check_scale("sigmas_rad", self.sigmas_rad)
         for name, vectors in (("directions_in_camera", self.directions_in_camera), ("down", self.down[None])):
             lengths = np.linalg.norm(vectors, axis=1)
             if not np.all(np.abs(lengths - 1) < _UNIT):
@@ -129,7 +130,7 @@ class DistancePrior(Value):
         _set(self, "sigmas", (count,))
         if not np.all((self.distances >= 0) & np.isfinite(self.distances)):
             raise ValueError(f"distances must be finite and not negative, got {_range(self.distances)}")
-        _check_positive("sigmas", self.sigmas)
+        check_scale("sigmas", self.sigmas)
         _check_loss(self)
 
 
@@ -249,7 +250,9 @@ def _set_checked_positions(prior: PositionPrior | PointPrior, rows: str) -> None
     _set(prior, "positions", (count, 3))
     _set(prior, "covariances", (count, 3, 3))
     whitening(prior.covariances)
-    measured = np.isfinite(np.einsum("kaa->ka", prior.covariances))
+    variances = np.einsum("kaa->ka", prior.covariances)
+    measured = np.isfinite(variances)
+    check_scale("standard deviations of positions", np.sqrt(variances[measured]))
     if not np.all(np.isfinite(prior.positions[measured])):
         raise ValueError("positions must be finite where they were measured")
     _check_loss(prior)
@@ -257,12 +260,7 @@ def _set_checked_positions(prior: PositionPrior | PointPrior, rows: str) -> None
 
 def _check_loss(prior: Prior | PointPrior) -> None:
     loss_id(prior.loss)
-    _check_positive("loss_scale", prior.loss_scale)
-
-
-def _check_positive(name: str, values: FloatArray | float) -> None:
-    if not np.all((np.asarray(values) > 0) & np.isfinite(values)):
-        raise ValueError(f"{name} must be positive and finite, got {_range(np.atleast_1d(values))}")
+    check_scale("loss_scale", prior.loss_scale)
 
 
 def _range(values: FloatArray) -> str:

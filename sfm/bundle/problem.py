@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
+from sfm.bundle.limits import check_scale, check_tolerance
 from sfm.bundle.priors import PointPrior, Prior, check_rows, where_finite
 from sfm.bundle.rig_arrays import RigArrays, check_in_range
 from sfm.core.arrays import BoolArray, FloatArray, Value, readonly
@@ -46,9 +46,9 @@ class BundleProblem(Value):
         priors: what is known of poses and points besides.
 
     Raises:
-        ValueError: shapes disagree, a row or a model does not exist, a parameter that the model lacks is free, a
-            standard deviation is not positive, an expected parameter is not finite, a free one is out of its bounds, or
-            poses are not those of the rigs.
+        ValueError: shapes disagree, a row or a model does not exist, a parameter that the model lacks is free or not
+            finite, a standard deviation is not within `limits`, an expected parameter is not finite, a free one is out
+            of its bounds, or poses are not those of the rigs.
     """
 
     model_ids: Int32[np.ndarray, " C"]
@@ -94,8 +94,7 @@ class BundleProblem(Value):
         self._check_params()
         if self.obs_sigmas is not None:
             object.__setattr__(self, "obs_sigmas", readonly(self.obs_sigmas, (observations,), np.float64))
-            if not np.all((self.obs_sigmas > 0) & np.isfinite(self.obs_sigmas)):
-                raise ValueError("obs_sigmas must be positive and finite")
+            check_scale("obs_sigmas", self.obs_sigmas)
         if self.cams_from_world.shape != (images,):
             raise ValueError(f"{self.cams_from_world.shape} poses for {images} images")
         if self.rigs is not None:
@@ -147,6 +146,8 @@ class BundleProblem(Value):
             model = model_by_id(int(number))
             if self.free_params[self.model_ids == number, len(model.param_names) :].any():
                 raise ValueError(f"free_params must be False behind the {len(model.param_names)} of {model.name}")
+            if not np.isfinite(self.camera_params[self.model_ids == number, len(model.param_names) :]).all():
+                raise ValueError(f"camera_params must be zero behind the {len(model.param_names)} of {model.name}")
         lower, upper = self.param_bounds
         bounded = self.free_params & ~(np.isneginf(lower) & np.isposinf(upper))
         outside = bounded & ~((lower <= self.camera_params) & (self.camera_params <= upper))
@@ -157,8 +158,7 @@ class BundleProblem(Value):
             )
         if self.prior_params is None or self.prior_sigmas is None:
             return
-        if not np.all(self.prior_sigmas > 0):
-            raise ValueError("prior_sigmas must be positive")
+        check_scale("prior_sigmas", self.prior_sigmas[~np.isposinf(self.prior_sigmas)])
         if not np.all(np.isfinite(self.prior_params[self.free_params & (self.prior_sigmas < np.inf)])):
             raise ValueError("prior_params must be finite where a free parameter has a standard deviation")
 
@@ -198,10 +198,11 @@ class BundleConfig:
     CHOLMOD, where scikit-sparse is installed, or by conjugate gradients; see `reduced`."""
 
     def __post_init__(self) -> None:
-        if not (self.loss_scale_px > 0 and 0 < self.loss_scale_px * self.loss_scale_px < math.inf):
-            raise ValueError(f"loss_scale_px must be positive and finite, like its square, got {self.loss_scale_px}")
+        check_scale("loss_scale_px", self.loss_scale_px)
         if self.max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, got {self.max_iterations}")
+        check_tolerance("relative_cost_tolerance", self.relative_cost_tolerance)
+        check_tolerance("gradient_tolerance", self.gradient_tolerance)
         if self.solver not in get_args(SolverChoice):
             raise ValueError(f"solver must be one of {', '.join(get_args(SolverChoice))}, got {self.solver!r}")
         if self.gauge not in ("two_cameras", "three_points", "free"):

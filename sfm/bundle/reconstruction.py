@@ -71,7 +71,7 @@ def problem_from_reconstruction(
 
 def _rigs_of(reconstruction: Reconstruction, refine_sensors: bool) -> RigArrays | None:
     """Which images move together; None where each moves by itself."""
-    sensors = _sensors_of(reconstruction)
+    sensors = sensors_of(reconstruction)
     if not sensors:
         return None
     rows = {image_id: row for row, image_id in enumerate(reconstruction.image_ids)}
@@ -92,8 +92,12 @@ def _rigs_of(reconstruction: Reconstruction, refine_sensors: bool) -> RigArrays 
     )  # fmt: skip
 
 
-def _sensors_of(reconstruction: Reconstruction) -> dict[tuple[int, int], Rigid3]:
-    """The poses on their rigs of all sensors but the references, by rig and camera."""
+def sensors_of(reconstruction: Reconstruction) -> dict[tuple[int, int], Rigid3]:
+    """The poses on their rigs of all sensors but the references, by rig and camera, in the order of `RigArrays`.
+
+    Raises:
+        ValueError: one of them is not known.
+    """
     sensors = {}
     for rig in reconstruction.rigs:
         for camera_id, pose in rig.sensors_from_rig.items():
@@ -105,7 +109,7 @@ def _sensors_of(reconstruction: Reconstruction) -> dict[tuple[int, int], Rigid3]
 
 def _updated_rigs(reconstruction: Reconstruction, rigs: RigArrays) -> tuple[tuple[Rig, ...], tuple[Frame, ...]]:
     """Rigs and frames of the reconstruction with the poses of `rigs`."""
-    numbers = {key: row for row, key in enumerate(_sensors_of(reconstruction))}
+    numbers = {key: row for row, key in enumerate(sensors_of(reconstruction))}
     frame_of = dict(zip(reconstruction.image_ids, rigs.image_frames, strict=True))
     new_rigs = tuple(
         dataclasses.replace(

@@ -74,7 +74,7 @@ class BundleSystem:
         self.held[: len(held)] |= held
         self._known, self._bounds = Knowledge(problem, layout), ParamBounds.of(problem, layout)
         plan = plan_solver(layout, self.held, self._known.targets, config.solver)
-        announce(plan, _forecast_bytes(layout, plan, images, points))
+        announce(plan, system_bytes(layout, plan, images, points))
         self._images = ImageSums.allocate(images, widest)
         self._of_observations = np.empty((len(layout.image), 9 + 3 * widest))
         self.costs = np.empty(len(layout.image))
@@ -213,7 +213,8 @@ class BundleSystem:
         then.lost = int(lost)
         decrease += 0.5 * float(((self._reduced.scaling * delta - self._reduced.gradient) * delta).sum())
         decrease += bound_decrease
-        norm += _squared(row_centers) + len(row_centers) + _squared(now.params)
+        # Of cameras what may change: others, perhaps never used, may hold anything.
+        norm += _squared(row_centers) + len(row_centers) + _squared(now.params[self._places.cells])
         step_norm, norm = math.sqrt(step + _squared(delta)), math.sqrt(norm)
         return Trial(float(cost), float(decrease), step_norm, norm, self._steepness())
 
@@ -253,7 +254,7 @@ class BundleSystem:
         return self._state.frames.centers.take(self.layout.slot_frame, axis=0)
 
 
-def _forecast_bytes(layout: Layout, plan: SolverPlan, images: int, points: int) -> int:
+def system_bytes(layout: Layout, plan: SolverPlan, images: int, points: int) -> int:
     """About the memory of an adjustment: its layout, the solver, and the arrays that kernels fill."""
     columns, shared = layout.columns.shape[1], layout.image_shared.shape[1]
     observation = 44 + 4 * shared + 8 * (9 + 3 * columns) + 8

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sfm.pipeline.priors import Measurements, PriorConfig
 
 EXAMPLES = (
-    "sfm refine scene -o scene/refined --refine focal,pp,distortion",
+    "sfm refine scene --refine focal,pp,distortion",
     "sfm refine sparse/0 -o refined --loss cauchy --loss-scale 2 --sigmas",
     "sfm refine sparse/0 -o bounded --refine focal,distortion --bounds focal=0.9:1.1,distortion=-0.3:0.3",
     "sfm refine sparse/0 -o moved --refine none --hold points",
@@ -32,6 +32,12 @@ _FILE = tyro.conf.arg(metavar="FILE", help_behavior_hint="")
 _PX = tyro.conf.arg(metavar="PX", help_behavior_hint="")
 _UNITS = tyro.conf.arg(metavar="UNITS", help_behavior_hint="")
 _Solver: TypeAlias = Literal["auto", "dense", "sparse", "cholmod", "iterative"]
+_Gauge: TypeAlias = Literal["cameras", "points", "free"]
+_GAUGES: dict[_Gauge, Literal["two_cameras", "three_points", "free"]] = {
+    "cameras": "two_cameras",
+    "points": "three_points",
+    "free": "free",
+}
 _GPS_SIGMA_M = 5.0
 _KINDS: dict[str, Intrinsics] = {"focal": "focal", "pp": "principal_point", "distortion": "extra"}
 _SENSORS = "sensors"
@@ -52,8 +58,8 @@ class RefineOptions:
     model: Model
     """A workspace, or the folder of a COLMAP model."""
 
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint="")]
-    """Folder for the adjusted model."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER", help_behavior_hint="")] = None
+    """Folder for the adjusted model; of a workspace, the folder `refined` in it without this."""
 
     refine: Annotated[str, tyro.conf.arg(metavar="LIST")] = "focal,distortion"
     """What of the cameras may change: focal, pp (the principal point), distortion, sensors (their poses on a rig), with
@@ -79,7 +85,7 @@ class RefineOptions:
     """What a residual costs: trivial (its square), huber, soft_l1, cauchy, tukey, truncated."""
 
     loss_scale: Annotated[float, tyro.conf.arg(metavar="PX")] = 1.0
-    """Residual from which a loss grows more slowly."""
+    """Residual from which a loss grows more slowly; counts --pixel-sigma where that is given."""
 
     graduated: Flag = False
     """Narrow the scale of the loss step by step from the worst residual on; for tukey and truncated."""
@@ -134,7 +140,13 @@ class RefineOptions:
     """Standard deviation of keypoints, by which residuals are weighed against measurements."""
 
     sigmas: Flag = False
-    """Also standard deviations of the camera parameters."""
+    """Also standard deviations: of the camera parameters, and in two tables beside the model those of poses and points
+    (pose_sigmas.csv, point_sigmas.csv)."""
+
+    gauge: Annotated[_Gauge, tyro.conf.arg(metavar="NAME")] = "cameras"
+    """What stays in place, where no measurement says, and what standard deviations are relative to: cameras (one pose
+    and a coordinate of another, whose own are then zero), points (three points far apart), free (nothing, and standard
+    deviations are spread over all: the least there are)."""
 
     threads: Annotated[int, tyro.conf.arg(metavar="N", help_behavior_hint="(default: all cores)")] = 0
     """At most so many at once. The result does not depend on it."""
@@ -163,20 +175,18 @@ def main(words: Sequence[str]) -> int:
     from sfm.bundle import BundleConfig
     from sfm.cli.compare import model_folder
     from sfm.cli.refine_report import summary
+    from sfm.cli.refine_tables import write_tables
     from sfm.core.execution import available_threads
     from sfm.core.optim.losses import LOSSES
     from sfm.io.atomic import write_text
-    from sfm.io.colmap_model import model_format, read_model, write_model
+    from sfm.io.colmap_model import read_model, write_model
     from sfm.pipeline.refinement import RefinementConfig, refine_model
     from sfm.viz.convergence import convergence_svg
 
     if options.loss not in LOSSES:
         raise ConfigError(f"unknown loss {options.loss!r}", remedy=f"choose one of {', '.join(LOSSES)}")
     source = model_folder(options.model)
-    if source.resolve() == options.output.resolve():
-        raise InputError("is both source and target", path=options.output, remedy="name another folder")
-    if model_format(options.output) and not options.overwrite:
-        raise InputError("is there already", path=options.output, remedy="choose another folder, or --overwrite it")
+    target = _target(options, source)
     try:
         bundle = BundleConfig(
             loss=options.loss,
@@ -185,6 +195,7 @@ def main(words: Sequence[str]) -> int:
             max_iterations=options.max_iterations,
             relative_cost_tolerance=options.tolerance,
             solver=options.solver,
+            gauge=_GAUGES[options.gauge],
         )
         config = RefinementConfig(
             intrinsics=tuple(_KINDS[kind] for kind in kinds if kind != _SENSORS),
@@ -211,13 +222,39 @@ def main(words: Sequence[str]) -> int:
         )
     except InputError as error:
         raise InputError(error.cause, path=source, remedy=error.remedy) from error
-    write_model(refined.reconstruction, options.output, text=options.text)
-    if refined.frame is not None:
-        write_text(options.output / "frame.json", json.dumps(refined.frame.to_json(), indent=2) + "\n")
+    write_model(refined.reconstruction, target, text=options.text)
+    write_tables(refined, target, overwrite=options.overwrite)
     if options.plot is not None:
         write_text(options.plot, convergence_svg(refined.result.table, f"sfm refine {options.model}"))
-    print(json.dumps(refined.to_json(), indent=2) if options.json else summary(refined, options.output))
+    if options.json:
+        print(json.dumps(refined.to_json(), indent=2))
+    else:
+        print(summary(refined, target, options.graduated))
     return ExitCode.OK
+
+
+def _target(options: RefineOptions, source: Path) -> Path:
+    """The folder to write, looked at before anything is adjusted.
+
+    Raises:
+        ConfigError: none is named, and the model is not that of a workspace.
+        InputError: it is the source, or a model is there already, or it cannot be a folder.
+    """
+    from sfm.io.colmap_model import model_format
+
+    target = options.output
+    if target is None and source == options.model / "sparse" / "0":
+        target = options.model / "refined"
+    if target is None:
+        raise ConfigError("-o is missing, the folder for the adjusted model", remedy="only a workspace has its own")
+    if source.resolve() == target.resolve():
+        raise InputError("is both source and target", path=target, remedy="name another folder")
+    there = next(folder for folder in (target, *target.absolute().parents) if folder.exists() or folder.is_symlink())
+    if not there.is_dir():
+        raise InputError("is a file, not a folder", path=there, remedy="choose another folder, or move what lies there")
+    if model_format(target) and not options.overwrite:
+        raise InputError("is there already", path=target, remedy="choose another folder, or --overwrite it")
+    return target
 
 
 def _bounds(text: str, free: Sequence[str]) -> dict[str, tuple[float, float]]:

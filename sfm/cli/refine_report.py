@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from sfm.pipeline.refinement import MeasuredFrame, RefinedModel
+    from sfm.pipeline.refined_model import MeasuredFrame, RefinedModel
 
 _REASONS = {
     "relative_cost": "a full step hardly lowered the cost",
@@ -19,19 +20,16 @@ _REASONS = {
 }
 
 
-def summary(refined: RefinedModel, folder: Path) -> str:
+def summary(refined: RefinedModel, folder: Path, graduated: bool = False) -> str:
     """A few lines for a person."""
     result, model = refined.result, refined.reconstruction
     count = max(len(result.problem.obs_images) - result.invalid, 1)
-    how = " (by the loss)"
-    before, after = ((2 * cost / count) ** 0.5 for cost in (result.initial_cost, result.final_cost))
-    if refined.frame is not None:
-        # The cost is also that of the measurements.
-        how, (before, after) = "", refined.frame.rms_px
+    before, after = refined.rms_px
     lines = [
         f"{len(model.image_ids)} images · {len(model.points3D)} points · {count} observations",
-        f"root mean square reprojection error {before:.4f} → {after:.4f} px{how}, "
-        f"cost {result.initial_cost:.6g} → {result.final_cost:.6g}",
+        f"root mean square reprojection error {before:.4f} → {after:.4f} px, "
+        f"cost {result.initial_cost:.6g} → {result.final_cost:.6g}"
+        + (" by the last scale of the loss" if graduated else ""),
         f"{result.iterations} iterations; {_REASONS[result.reason]}",
         *_measured_lines(refined.frame),
     ]
@@ -43,8 +41,7 @@ def summary(refined: RefinedModel, folder: Path) -> str:
         lines.append(f"camera {camera_id}: {', '.join(names)} ended on a bound")
     if len(refined.at_bounds) > 5:
         lines.append(f"and parameters of {len(refined.at_bounds) - 5} more cameras")
-    if refined.undetermined:
-        lines.append(f"no standard deviations: the observations leave open {refined.undetermined}")
+    lines += _uncertainty_lines(refined)
     for camera_id, camera in list(model.cameras.items())[:5]:
         sigmas = refined.sigmas(camera_id)
         told = [
@@ -55,6 +52,36 @@ def summary(refined: RefinedModel, folder: Path) -> str:
     if len(model.cameras) > 5:
         lines.append(f"and {len(model.cameras) - 5} more cameras (--json has them all)")
     return "\n".join([*lines, f"model    {folder}"])
+
+
+def _uncertainty_lines(refined: RefinedModel) -> list[str]:
+    """Of which noise standard deviations are, or why there are none."""
+    from sfm.core.errors import Rejected
+
+    told = refined.uncertainty
+    if told is None:
+        return []
+    if isinstance(told, Rejected):
+        return [f"no standard deviations: the observations leave open {refined.undetermined}"]
+    medians = [f"{name} ± {value:.2g}{unit}" for name, value, unit in _medians(refined) if math.isfinite(value)]
+    tables = f"{', '.join(medians) or 'nothing uncertain'} (medians; pose_sigmas.csv, point_sigmas.csv)"
+    if told.keypoint_sigma_px == told.noise_px:
+        return [f"standard deviations for the noise that the residuals show, {told.noise_px:.3g} px", tables]
+    stated = f"standard deviations for keypoints of {told.keypoint_sigma_px:g} px, as stated (--pixel-sigma); "
+    if math.isnan(told.noise_px):
+        return [stated + "no observation is left over to tell their noise", tables]
+    return [stated + f"the residuals show {told.noise_px:.3g} px", tables]
+
+
+def _medians(refined: RefinedModel) -> list[tuple[str, float, str]]:
+    found, unit = refined.median_sigmas, " units"
+    if refined.frame is not None:
+        unit = " m" if refined.frame.origin is not None else ""
+    return [
+        ("camera centres", found["centers"], unit),
+        ("rotations", found["rotations_deg"], "°"),
+        ("points", found["points"], unit),
+    ]
 
 
 def _measured_lines(frame: MeasuredFrame | None) -> list[str]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sfm.bundle.limits import check_scale
 from sfm.bundle.prior_terms import point_prior_residuals, prior_residuals
 from sfm.bundle.priors import (
     DistancePrior,
@@ -59,8 +60,8 @@ class PriorConfig:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, float | int) and not 0 < value < np.inf:
-                raise ValueError(f"{field.name} must be positive and finite, got {value}")
+            if isinstance(value, float | int):
+                check_scale(field.name, value)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -116,9 +117,10 @@ def priors_of(model: Reconstruction, measured: Measurements, config: PriorConfig
         absent += len(positions.names) - len(rows)
     if (directions := measured.directions) is not None:
         rows, measured_rows = _matched(model, directions.names, "direction")
-        sigmas = _completed(directions.sigmas_deg[measured_rows], config.gravity_sigma_deg, "directions", "")
+        default = np.deg2rad(config.gravity_sigma_deg)
+        sigmas = _completed(np.deg2rad(directions.sigmas_deg[measured_rows]), default, "directions", "")
         vectors = directions.directions[measured_rows]
-        priors.append(GravityPrior(rows, vectors, np.deg2rad(sigmas), _DOWN, **settings))
+        priors.append(GravityPrior(rows, vectors, sigmas, _DOWN, **settings))
         kinds.append("gravity")
         absent += len(directions.names) - len(rows)
     if (distances := measured.distances) is not None:
@@ -222,7 +224,12 @@ def _local(positions: MeasuredPositions, rows: np.ndarray) -> tuple[FloatArray, 
 def _completed(sigmas: FloatArray, default: float | None, what: str, option: str) -> FloatArray:
     if default is None and np.any(np.isnan(sigmas)):
         raise InputError(f"it is not said how certain {what} are", remedy=f"give columns of sigmas, or --{option}")
-    return np.where(np.isnan(sigmas), default or np.nan, sigmas)
+    completed = np.where(np.isnan(sigmas), default or np.nan, sigmas)
+    try:
+        check_scale(f"standard deviations of {what}", completed)
+    except ValueError as error:
+        raise InputError(str(error), remedy="correct the table, or choose another unit") from error
+    return completed
 
 
 def _distances(

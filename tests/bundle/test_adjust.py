@@ -5,14 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfm.bundle import BundleConfig, BundleCovariance, adjust, covariance, squared_errors
-from sfm.bundle.problem import SolverChoice
+from sfm.bundle import BundleConfig, adjust, squared_errors
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.events import BundleAdjusted, BundlePlanned
 from sfm.core.geometry.rigid import Rigid3
 
 TIGHT = BundleConfig(relative_cost_tolerance=1e-12, max_iterations=200)
-SPARSE: tuple[SolverChoice, ...] = ("sparse", "cholmod")
 LOSSES = ("trivial", "huber", "soft_l1", "cauchy")
 
 
@@ -260,18 +258,6 @@ def test_losses_that_give_up_on_outliers_find_the_truth_from_afar_if_graduated(m
     assert (found[True][~wrong] < 2).mean() > 0.97
     assert (found[True][wrong] > 2).mean() > 0.9
     assert np.median(found[False][~wrong]) > 2
-
-
-def test_cholmod_takes_the_same_steps_as_our_sparse_factor(make_problem, perturbed, rng):
-    pytest.importorskip("sksparse.cholmod")
-    problem = perturbed(make_problem(rng, images=8, points=120, noise_px=0.5, free_params=(0, 1)), rng)
-    ours, theirs = (adjust(problem, BundleConfig(solver=solver)) for solver in SPARSE)
-    assert theirs.iterations == ours.iterations
-    assert theirs.final_cost == pytest.approx(ours.final_cost, rel=1e-9)
-    found, expected = covariance(theirs.problem, BundleConfig(solver="cholmod")), covariance(ours.problem)
-    assert isinstance(found, BundleCovariance)
-    assert isinstance(expected, BundleCovariance)
-    np.testing.assert_allclose(found.params, expected.params, rtol=1e-5)
 
 
 @pytest.mark.parametrize("loss", ["trivial", "cauchy"])

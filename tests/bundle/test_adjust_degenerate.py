@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sfm.bundle import BundleConfig, adjust, squared_errors
+from sfm.bundle.priors import DistancePrior, GravityPrior, PointPrior, PositionPrior
 from sfm.core.cameras._kernels import MAX_PARAMS
 from sfm.core.geometry.rigid import Rigid3
 
@@ -196,8 +197,75 @@ def test_arrays_that_do_not_fit_are_refused(make_problem, rng, change):
 
 
 def test_settings_out_of_range_are_refused():
-    for scale in (0.0, -1.0, 1e-200, 1e200, np.inf, np.nan):
+    for scale in (0.0, -1.0, 1e-200, 1e-13, 1e13, 1e200, np.inf, np.nan):
         with pytest.raises(ValueError, match="loss_scale_px"):
             BundleConfig(loss_scale_px=scale)
+    for tolerance in (-1.0, 1.0, 2.0, np.inf, np.nan):
+        with pytest.raises(ValueError, match="relative_cost_tolerance"):
+            BundleConfig(relative_cost_tolerance=tolerance)
+        with pytest.raises(ValueError, match="gradient_tolerance"):
+            BundleConfig(gradient_tolerance=tolerance)
+    BundleConfig(relative_cost_tolerance=0.0, gradient_tolerance=0.0)
     with pytest.raises(ValueError, match="max_iterations"):
         BundleConfig(max_iterations=-1)
+
+
+@pytest.mark.parametrize("sigma", [1e-200, 1e-13, 1e13])
+def test_absurd_standard_deviations_are_refused(make_problem, rng, sigma):
+    problem = make_problem(rng)
+    observations, images = len(problem.obs_images), np.arange(6, dtype=np.int32)
+    far, one = np.full(problem.camera_params.shape, np.inf), np.ones(1)
+    far[0, 0] = sigma
+    for change in (
+        {"obs_sigmas": np.r_[sigma, np.ones(observations - 1)]},
+        {"prior_params": problem.camera_params, "prior_sigmas": far},
+    ):
+        with pytest.raises(ValueError, match=r"within 1e-12\.\."):
+            dataclasses.replace(problem, **change)
+    for make in (
+        lambda: PositionPrior.of_sigmas(images, np.zeros((6, 3)), sigma),
+        lambda: PositionPrior.of_sigmas(images, np.zeros((6, 3)), 1.0, bias_sigma=sigma),
+        lambda: PointPrior.of_sigmas(images, np.zeros((6, 3)), sigma),
+        lambda: GravityPrior(images[:1], np.eye(3)[:1], sigma * one, np.eye(3)[0]),
+        lambda: DistancePrior(images[:1], images[1:2], one, sigma * one),
+        lambda: DistancePrior(images[:1], images[1:2], one, one, loss_scale=sigma),
+    ):
+        with pytest.raises(ValueError, match=r"within 1e-12\.\.1e|positive variances"):
+            make()
+
+
+def test_the_least_and_the_largest_standard_deviations_give_finite_costs(make_problem, perturbed, rng):
+    problem = perturbed(make_problem(rng, noise_px=0.3, free_params=(0,)), rng, 0.01)
+    for sigma in (1e-12, 1e12):
+        known = np.full(problem.camera_params.shape, np.inf)
+        known[0, 0] = sigma
+        stated = dataclasses.replace(
+            problem,
+            obs_sigmas=np.full(len(problem.obs_images), sigma),
+            prior_params=problem.camera_params + 1.0,
+            prior_sigmas=known,
+        )
+        for loss in ("trivial", "cauchy"):
+            result = adjust(stated, BundleConfig(loss=loss, loss_scale_px=sigma, max_iterations=5))
+            assert np.isfinite([row.cost for row in result.table]).all()
+            assert np.isfinite(result.problem.points3D).all()
+
+
+@pytest.mark.parametrize("value", [1e20, 1e160, np.inf, np.nan])
+def test_a_camera_that_no_image_has_may_hold_anything(make_problem, perturbed, rng, value):
+    problem = perturbed(make_problem(rng, noise_px=0.3, free_params=(0,)), rng, 0.01)
+    unused = dataclasses.replace(
+        problem,
+        model_ids=np.r_[problem.model_ids, problem.model_ids].astype(np.int32),
+        camera_params=np.concatenate([problem.camera_params, np.where(np.arange(MAX_PARAMS) < 4, value, 0.0)[None]]),
+        free_params=np.concatenate([problem.free_params, np.zeros((1, MAX_PARAMS), bool)]),
+    )
+    found, expected = adjust(unused), adjust(problem)
+    assert found.table == expected.table
+    padded = problem.camera_params.copy()
+    padded[0, -1] = value
+    if np.isfinite(value):
+        assert adjust(dataclasses.replace(problem, camera_params=padded)).table == expected.table
+    else:
+        with pytest.raises(ValueError, match="camera_params must be zero behind"):
+            dataclasses.replace(problem, camera_params=padded)

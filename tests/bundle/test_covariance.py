@@ -209,6 +209,15 @@ def test_a_prior_is_information(make_problem, rng):
             np.testing.assert_allclose(found.params, without.params, rtol=1e-6)
 
 
+def test_without_anything_left_over_there_is_no_variance_factor_and_nothing_to_scale(make_problem, rng):
+    found = covariance(make_problem(rng, images=2, points=5, seen=1.1))
+    assert isinstance(found, BundleCovariance)
+    assert np.isnan(found.variance_factor)
+    assert np.isfinite(found.poses).all()
+    with pytest.raises(ValueError, match="positive and finite"):
+        found.scaled()
+
+
 def test_what_observations_leave_open_is_named(make_problem, rng):
     problem = make_problem(rng, images=5, points=40, seen=1.0)
     # Image 3 sees two points only: four equations for six unknowns.

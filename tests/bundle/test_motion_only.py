@@ -321,7 +321,17 @@ def test_impossible_problems_are_refused(rng, changes, words):
 
 
 @pytest.mark.parametrize(
-    "settings", [{"loss": "median"}, {"loss_scale_px": 0.0}, {"loss_scale_px": float("nan")}, {"max_iterations": -1}]
+    "settings",
+    [
+        {"loss": "median"},
+        {"loss_scale_px": 0.0},
+        {"loss_scale_px": float("nan")},
+        {"loss_scale_px": 1e-160},
+        {"max_iterations": -1},
+        {"relative_cost_tolerance": float("nan")},
+        {"relative_cost_tolerance": -1.0},
+        {"gradient_tolerance": 1.0},
+    ],
 )
 def test_impossible_settings_are_refused(settings):
     with pytest.raises((ValueError, jaxtyping.TypeCheckError)):

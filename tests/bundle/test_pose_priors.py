@@ -6,9 +6,10 @@ import pytest
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
-from sfm.bundle.mounted_terms import on_frames
+from sfm.bundle.mounted_terms import by_sensors, on_frames
 from sfm.bundle.prior_gauge import entries_to_hold, open_motions
 from sfm.bundle.prior_terms import (
+    PriorTerms,
     bias_count,
     linearize_point_priors,
     linearize_priors,
@@ -144,6 +145,26 @@ def test_images_on_rigs_move_with_them(rng):
         numeric[:, column] = stepped.ravel().imag / 1e-20
     numeric[:, [c for c in range(18, 30) if c % 6 > 2]] = 0
     np.testing.assert_allclose(dense(terms, 5), numeric, rtol=1e-6, atol=1e-9 * np.abs(numeric).max())
+
+
+def test_derivatives_by_sensors_agree_with_complex_steps(rng):
+    """A sensor moves by exp(ω) R and exp(ω) t + υ, and its image with it; biases do not."""
+    priors, biases = groups(rng), rng.normal(size=(2, 3))
+    rotations, centers = poses(rng)
+    translations = -np.einsum("iab,ib->ia", rotations, centers)
+    _, terms = linearize_priors(priors, rotations, centers, biases)
+    numeric = np.empty((terms.residuals.size, 6 * IMAGES))
+    for column in range(6 * IMAGES):
+        delta = np.zeros((IMAGES, 6), complex)
+        delta.flat[column] = 1e-20j
+        turns = np.array([expm(skew_of(step[:3])) for step in delta])
+        turned = turns @ rotations
+        shifted = np.einsum("iab,ib->ia", turns, translations) + delta[:, 3:]
+        stepped = analytic_residuals(priors, turned, -np.einsum("iba,ib->ia", turned, shifted), biases, (0.4, 2.0))
+        numeric[:, column] = stepped.ravel().imag / 1e-20
+    numbers = (np.where(n < IMAGES, n, -1).astype(np.int32) for n in (terms.first, terms.second))
+    found = dense(PriorTerms(terms.residuals, *numbers, *by_sensors(terms, rotations)), IMAGES)
+    np.testing.assert_allclose(found, numeric, rtol=1e-6, atol=1e-9 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("loss", ["trivial", *ROBUST])

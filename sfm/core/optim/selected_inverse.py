@@ -33,6 +33,8 @@ def front_inverse(L: FloatArray, pivots: int, below: FloatArray) -> FloatArray:
         pivots: its strips of pivots.
         below: Z₂₂, padded likewise; (0, 0) where there are no rows below.
     """
+    if not pivots:
+        return below
     L11, L21 = _unpacked(L, pivots, len(below))
     if not len(below):
         inverse = _potri(L11.T, lower=0, overwrite_c=1)[0]
