@@ -151,12 +151,14 @@ def _views(found: Calibration) -> Iterator[Finding]:
 
 def _poses(found: Calibration) -> Iterator[Finding]:
     tilts, directions = board_tilts(found)
-    steep = tilts > _TILT
-    if np.sum(steep) < max(3, 0.2 * len(tilts)):
+    steep, needed = tilts > _TILT, max(3, math.ceil(0.2 * len(tilts)))
+    if np.sum(steep) < needed:
+        count = int(np.sum(steep))
         yield Finding(
             "few_tilts",
-            f"{int(np.sum(steep))} of {len(tilts)} boards are tilted by more than {math.degrees(_TILT):.0f}°",
-            "tilt the board by 30° to 45°",
+            f"only {count} of {len(tilts)} boards {'is' if count == 1 else 'are'} tilted by more than "
+            f"{math.degrees(_TILT):.0f}°, and {needed} should be",
+            "tilt the board by 30° to 45°" if count < len(tilts) else "add photos of the board tilted by 30° to 45°",
         )
     else:
         # Tilts to the left and to the right are about one axis: twice the angle tells them apart from up and down.
@@ -187,11 +189,11 @@ def _shape_of_residuals(found: Calibration) -> Iterator[Finding]:
     white = whiteness(found)
     board, image = (share > _SHARE and share > _CLEAR * sigma for share, sigma in (white.board, white.image))
     if board:
-        richer = "paraboloid or free" if found.shape.kind in ("flat", "scale") else "free"
+        richer = {"flat": "paraboloid or free", "scale": "paraboloid or free", "free": ""}.get(found.shape.kind, "free")
         yield Finding(
             "bent_board",
             f"{100 * white.board[0]:.0f} % of the variance of residuals is corners that lie elsewhere than designed",
-            f"let the board's shape be estimated ({richer}), or glue it to glass",
+            f"let the board's shape be estimated ({richer}), or glue it to glass" if richer else "glue it to glass",
         )
     if image:
         yield Finding(

@@ -10,9 +10,10 @@ Held-out views are blind where camera and board may be exchanged for one another
 in a second of video, are predicted well by a wrong pair of them. Then the camera is uncertain; shapes with which it is
 much more uncertain than with another are not chosen. (Otherwise it is less so, since smaller residuals outweigh the
 additional unknowns: the uncertainty with the richest shape is 0.3 to 1.05 of that with a flat board for eight of nine
-sets, and 4.6 for the one that is a second of video.) The uncertainty meant here is that of independent corners: far too
-low, but its ratio is a matter of how boards were held. The one by views is noise to it: with a bent board rather than a
-flat one it is 1.9 times as large for OpenCV's right photos and 1.1 for the left ones, 1.5 for the second of video.
+sets, and 4.6 for the one that is a second of video.) The uncertainty meant here is that of corners that are independent
+and all alike: too low, but its ratio is a matter of how boards were held. The one by views is noise to it: with a bent
+board rather than a flat one it is 1.9 times as large for OpenCV's right photos and 1.1 for the left ones, and 1.5 for
+the second of video.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def _judged(
 
 
 def _camera_bound(found: Calibration) -> float:
-    covariances = covariance(found)
+    covariances = covariance(found, alike=True)
     return math.inf if isinstance(covariances, Rejected) else rms_uncertainty(found, covariances, across=16)
 
 
@@ -196,12 +197,16 @@ def _why_not(row: RankedShape, simpler: RankedShape) -> tuple[str, str] | None:
 
 
 def _told(row: RankedShape, chosen: RankedShape, why: tuple[str, str] | None) -> RankedShape:
-    if why is None:
+    """What stands beside a shape: why it was not taken, if it predicts better than the one that was.
+
+    It may have been barred beside a simpler shape, and predict worse than the one that was taken in the end.
+    """
+    if row.held is None or row.kind == chosen.kind or not row.held_out_rms_px < chosen.held_out_rms_px:
         return row
+    if why is None or not is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
+        return dataclasses.replace(row, refused="not clearly better")
     errors = chosen.held_out_rms_px, row.held_out_rms_px
-    brings = ""
-    if is_clearly_lower(_squares(row), _squares(chosen), _CLEAR):
-        brings = what_it_brings(f"{NAMES[row.kind]} board shape", errors, *why, f"--shape {row.kind}")
+    brings = what_it_brings(f"{NAMES[row.kind]} board shape", errors, *why, f"--shape {row.kind}")
     return dataclasses.replace(row, refused=why[0], would_bring=brings)
 
 

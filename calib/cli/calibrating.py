@@ -20,6 +20,7 @@ from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
+from calib.cli.tried import with_what_was_tried
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
 from calib.diagnose_window import window_finding
@@ -128,8 +129,8 @@ class CalibratedCamera(Value):
     halves: SplitHalf | Rejected
     left_out: tuple[RejectedView, ...]
     findings: tuple[Finding, ...]
-    would_bring: tuple[str, ...] = ()
     flat_px: float = math.nan
+    would_bring: tuple[str, ...] = ()
 
     @property
     def doubts(self) -> CalibrationCovariance | Rejected:
@@ -258,9 +259,14 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=(*_turned(seen, config), *_findings(seen, found, plain if isinstance(by_view, Rejected) else by_view)),
-        would_bring=(*would_bring(lenses), *would_bring(shapes)),
+        findings=(
+            *_turned(seen, config),
+            *with_what_was_tried(
+                _findings(seen, found, plain if isinstance(by_view, Rejected) else by_view), lenses, shapes
+            ),
+        ),
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
+        would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
 
 
@@ -279,12 +285,6 @@ def _turned(seen: Sightings, config: CalibrationConfig) -> Iterator[Finding]:
     )
 
 
-def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
-    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
-    able = [row for row in rows if row.would_bring]
-    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
-
-
 def _held_out_flat(
     seen: Sightings, found: Calibration, config: CalibrationConfig, shapes: Sequence[RankedShape],
     held_out: HeldOut | Rejected, plan: CameraPlan,
@@ -300,6 +300,12 @@ def _held_out_flat(
         return math.nan
     held = hold_out(seen.points3D, flat, plain, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     return math.nan if isinstance(held, Rejected) else held.rms_px
+
+
+def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
+    """What the best of those would bring that predict better than the one that was taken; at most one sentence."""
+    able = [row for row in rows if row.would_bring]
+    return [min(able, key=lambda row: row.held_out_rms_px).would_bring] if able else []
 
 
 def _findings(

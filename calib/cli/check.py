@@ -16,6 +16,7 @@ from sfm.core.errors import ConfigError, ExitCode, InputError, Rejected
 
 if TYPE_CHECKING:
     from calib.boards import Board
+    from calib.check import CameraCheck
     from calib.cli.calibrating import Sightings
     from sfm.core.cameras import Camera
     from sfm.io.camera_records import CameraRecord
@@ -70,10 +71,7 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CheckOptions, "check", words, EXAMPLES)
     _check_options(options)
 
-    from calib.board_turns import board_turns
-    from calib.check import check_camera, known_shape
     from calib.cli.calibrating import see_board
-    from calib.cli.check_limits import limit_of, shapes_to_try
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
@@ -92,22 +90,9 @@ def main(words: Sequence[str]) -> int:
         )  # fmt: skip
         finding = shown_size(seen, options.images)
         camera, sigmas = _at_size(original, record, seen)
-        turns = board_turns(seen.board) if seen.board is not None else ()
-        shapes = shapes_to_try(record, known, seen)
-        limit = limit_of(record, options.max_error, with_shape=bool(shapes))
-        tried = [
-            check_camera(
-                camera, shape, seen.views, limit_px=limit.px, sigmas=sigmas,
-                stated_px=record.number("rms_px") * camera.width / original.width,
-                is_ours=record.facts.get("kind") == "photos", turns=turns,
-            )
-            for shape in (shapes or [known_shape(seen.points3D)])
-        ]  # fmt: skip
-    able = [one for one in tried if not isinstance(one, Rejected)]
-    if not able:
-        assert isinstance(tried[0], Rejected)
-        raise no_check(seen, tried[0], options.images)
-    checked = min(able, key=lambda one: one.rms_px)
+        checked, limit_from = _checked(options, record, known, seen, camera, sigmas, camera.width / original.width)
+    if isinstance(checked, Rejected):
+        raise no_check(seen, checked, options.images)
     if finding is not None:
         checked = dataclasses.replace(checked, findings=(finding, *checked.findings))
     factor = camera.width / original.width
@@ -116,9 +101,9 @@ def main(words: Sequence[str]) -> int:
         points = checked.found.observations.points2D
         write_text(options.suggest, suggestions_svg(camera, seen.board, points, None, suggested))
     if options.json:
-        print(json.dumps(check_json(checked, seen, record, suggested, limit.why), indent=2, ensure_ascii=False))
+        print(json.dumps(check_json(checked, seen, record, suggested, limit_from), indent=2, ensure_ascii=False))
     else:
-        print("\n".join(check_lines(checked, seen, record, suggested, limit.why)))
+        print("\n".join(check_lines(checked, seen, record, suggested, limit_from)))
     return ExitCode.QUALITY_GATE_FAILED if checked.failed else ExitCode.OK
 
 
@@ -149,6 +134,29 @@ def _read(path: Path) -> tuple[Camera, CameraRecord]:
     stated = stated_error_px(path)
     facts: dict[str, Fact] = {"rms_px": stated} if math.isfinite(stated) else {}
     return next(iter(cameras.values())), CameraRecord(facts)
+
+
+def _checked(
+    options: CheckOptions, record: CameraRecord, known: Board | None, seen: Sightings, camera: Camera,
+    sigmas: dict[str, float], resized_by: float,
+) -> tuple[CameraCheck | Rejected, str]:  # fmt: skip
+    """The check by the shape of the board that suits best, of those it may have, and where its limit comes from."""
+    from calib.board_turns import board_turns
+    from calib.check import check_camera, known_shape
+    from calib.cli.check_limits import limit_of, shapes_to_try
+
+    shapes = shapes_to_try(record, known, seen)
+    limit = limit_of(record, options.max_error, with_shape=bool(shapes))
+    tried = [
+        check_camera(
+            camera, shape, seen.views, limit_px=limit.px, sigmas=sigmas,
+            stated_px=record.number("rms_px") * resized_by, is_ours=record.facts.get("kind") == "photos",
+            turns=board_turns(seen.board) if seen.board is not None else (),
+        )
+        for shape in (shapes or [known_shape(seen.points3D)])
+    ]  # fmt: skip
+    able = [check for check in tried if not isinstance(check, Rejected)]
+    return (min(able, key=lambda check: check.rms_px) if able else tried[0]), limit.why
 
 
 def _known_board(options: CheckOptions, record: CameraRecord) -> Board | None:

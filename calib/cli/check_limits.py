@@ -94,7 +94,7 @@ def limit_of(record: CameraRecord, max_error: float | None, *, with_shape: bool)
     if max_error is not None:
         return Limit(max_error, "by --max-error")
     flat, held_out, trained = (record.number(key) for key in ("holdout_flat_px", "holdout_rms_px", "rms_px"))
-    if not with_shape and math.isfinite(flat):
+    if not with_shape and math.isfinite(flat) and flat != held_out:
         return Limit(_TOLERANCE * flat, "twice the error of photos held out with the board taken for flat")
     if math.isfinite(held_out):
         return Limit(_TOLERANCE * held_out, "twice the error of photos held out")

@@ -32,7 +32,7 @@ displacements = [[1e-5, 0.0, 2e-5], …]     # metres from where the corners wer
 
 [[finding]]
 cause = "few_tilts"
-detail = "2 of 14 boards are tilted by more than 20°"
+detail = "only 2 of 14 boards are tilted by more than 20°, and 3 should be"
 remedy = "tilt the board by 30° to 45°"
 """
 

@@ -103,3 +103,17 @@ def test_few_views_are_told(rng):
 def test_pixels_far_from_any_board_are_uncertain(count, rng):
     found = calibrated(good(rng, count=6 * count, reach=0.05))
     assert "uncertain_corners" in causes(found)
+
+
+@pytest.mark.parametrize(("count", "remedy"), [(2, "add photos"), (12, "tilt the board")])
+def test_how_many_tilts_are_missing_is_told(count, remedy, rng):
+    if count == 2:  # two boards, both tilted
+        poses = [Rigid3(Rotation3.exp(np.array(turn)), np.array([0, 0, 0.4])) for turn in ([0.6, 0, 0], [0, 0.6, 0.0])]
+        views = seen(LENS, BOARD, poses, rng)
+    else:
+        views = good(rng, count=count, tilt=0.2, reach=0.2)
+    found = calibrated(views, dataclasses.replace(CONFIG, min_views=2))
+    told = next(finding for finding in diagnose(found) if finding.cause == "few_tilts")
+    assert told.detail.startswith("only ")
+    assert told.detail.endswith(" should be")
+    assert told.remedy.startswith(remedy)
