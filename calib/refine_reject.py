@@ -47,7 +47,7 @@ def without_copies(views: Sequence[BoardView]) -> tuple[list[BoardView], list[Re
     for view in views:
         key = view.corner_ids.tobytes() + view.points2D.tobytes()
         if key in first:
-            copies.append(RejectedView(view.name, f"copy_of {first[key]}", "the same corners to the last bit"))
+            copies.append(RejectedView(view.name, f"copy_of {first[key]}"))
         else:
             first[key] = view.name
             kept.append(view)

@@ -71,7 +71,8 @@ def read_alike(fit: Fit, observations: Observations, homographies: Homographies)
     if isinstance(solved, Rejected) or not other.shape[1]:
         return observations
     quadratics = _quadratics(fit, solved[0], _part(free, np.hstack([same, other])), changes, np.hstack([same, other]))
-    return read_after(observations, _chosen(quadratics, _composed(turns), other.shape[1]), turns)
+    chosen = most_likely_turns(quadratics, _composed(turns), other.shape[1])
+    return observations if chosen is None else read_after(observations, chosen, turns)
 
 
 def read_after(observations: Observations, chosen: Int64[np.ndarray, " V"], turns: Sequence[BoardTurn]) -> Observations:
@@ -120,7 +121,7 @@ def _composed(turns: Sequence[BoardTurn]) -> Int64[np.ndarray, "G G"]:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class _Quadratics(Value):
+class Quadratics(Value):
     """Costs of views by changes of the camera and the shape, in units of the noise; what turns change comes last.
 
     Attributes:
@@ -135,7 +136,7 @@ class _Quadratics(Value):
 
 def _quadratics(
     fit: Fit, solved: CalibrationSystem, shape: BoardShape, changes: FloatArray, columns: FloatArray
-) -> _Quadratics:
+) -> Quadratics:
     """The views about a solution, by all coefficients of the shape.
 
     Corners that are far off take little part, since nothing has been rejected yet.
@@ -145,11 +146,7 @@ def _quadratics(
     system = CalibrationSystem(
         solved.observations, about, fit.lens.columns(), free_shape=True, loss="cauchy", loss_scale=2 * sigma
     )
-    lower = np.tril(system.blocks) / sigma**2
-    full = lower + np.tril(lower, -1).swapaxes(1, 2)
-    W = full[:, :6, 6:]
-    reduced = full[:, 6:, 6:] - W.swapaxes(1, 2) @ np.linalg.solve(full[:, :6, :6], W)
-    A, b = reduced[:, :-1, :-1], -reduced[:, -1, :-1]
+    A, b = (part / sigma**2 for part in without_poses(system))
     free = len(fit.lens.columns())
     R = np.tile(np.eye(A.shape[1]), (len(changes), 1, 1))
     R[:, free:, free:] = columns.T @ changes @ columns
@@ -157,11 +154,22 @@ def _quadratics(
     prior = np.diag(A.sum(0)) * _RIDGE
     prior[free:] += 1 / (_BEND * nearest) ** 2
     A = R.swapaxes(1, 2)[:, None] @ A @ R[:, None]
-    return _Quadratics(A, np.einsum("gji,vj->gvi", R, b), np.diag(prior))
+    return Quadratics(A, np.einsum("gji,vj->gvi", R, b), np.diag(prior))
 
 
-def _chosen(quadratics: _Quadratics, composed: Int64[np.ndarray, "G G"], changed: int) -> Int64[np.ndarray, " V"]:
-    """Of each view the turn after which it is read; none of any where the choice is not to be believed.
+def without_poses(system: CalibrationSystem) -> tuple[FloatArray, FloatArray]:
+    """Of each view the normal matrix (V, K, K) of what views share, and the negative gradient (V, K)."""
+    lower = np.tril(system.blocks)
+    full = lower + np.tril(lower, -1).swapaxes(1, 2)
+    W = full[:, :6, 6:]
+    reduced = full[:, 6:, 6:] - W.swapaxes(1, 2) @ np.linalg.solve(full[:, :6, :6], W)
+    return reduced[:, :-1, :-1], -reduced[:, -1, :-1]
+
+
+def most_likely_turns(
+    quadratics: Quadratics, composed: Int64[np.ndarray, "G G"], changed: int
+) -> Int64[np.ndarray, " V"] | None:
+    """Of each view the turn after which it is read; None where the choice is not to be believed.
 
     Args:
         changed: number of coefficients that turns change.
@@ -178,7 +186,7 @@ def _chosen(quadratics: _Quadratics, composed: Int64[np.ndarray, "G G"], changed
     beyond, few = _BY_CHANCE
     views = len(chosen)
     if views <= _FEWEST or agreement <= beyond + few / (views - _FEWEST):
-        return np.zeros_like(chosen)
+        return None
     return np.where(sure, chosen, 0)
 
 
@@ -204,7 +212,7 @@ def _most_alike(products: FloatArray) -> Int64[np.ndarray, " V"]:
     return best
 
 
-def _settled(quadratics: _Quadratics, start: Int64[np.ndarray, " V"]) -> tuple[Int64[np.ndarray, " V"], FloatArray]:
+def _settled(quadratics: Quadratics, start: Int64[np.ndarray, " V"]) -> tuple[Int64[np.ndarray, " V"], FloatArray]:
     """Each view turned as the others want it, until none changes; and the costs (V, G) by what these say."""
     chosen, costs = start.copy(), np.empty((len(start), len(quadratics.A)))
     for _ in range(_ROUNDS):
@@ -217,7 +225,7 @@ def _settled(quadratics: _Quadratics, start: Int64[np.ndarray, " V"]) -> tuple[I
     return chosen, costs
 
 
-def _costs(quadratics: _Quadratics, chosen: Int64[np.ndarray, " V"], view: int) -> Vector:
+def _costs(quadratics: Quadratics, chosen: Int64[np.ndarray, " V"], view: int) -> Vector:
     """(G,) of a view after each turn, with the camera and the shape that the other views give."""
     every = np.arange(len(chosen))
     A, b = quadratics.A[chosen, every].sum(0), quadratics.b[chosen, every].sum(0)
@@ -226,7 +234,7 @@ def _costs(quadratics: _Quadratics, chosen: Int64[np.ndarray, " V"], view: int) 
     return 0.5 * np.einsum("i,gij,j->g", x, own[0], x, optimize=True) - own[1] @ x
 
 
-def _agreement(quadratics: _Quadratics, chosen: Int64[np.ndarray, " V"]) -> float:
+def _agreement(quadratics: Quadratics, chosen: Int64[np.ndarray, " V"]) -> float:
     """Mean over the views of the logarithm of how much likelier all is as chosen than with this one read otherwise."""
     every = np.arange(len(chosen))
     A, b = quadratics.A[chosen, every].sum(0) + quadratics.prior, quadratics.b[chosen, every].sum(0)

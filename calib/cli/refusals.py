@@ -66,7 +66,7 @@ def shown_size(seen: Sightings, sources: Sequence[Path]) -> Finding | None:
     """
     if seen.board is None or seen.board.kind != "chessboard" or seen.kind != "photos":
         return None
-    some = seen.views[:: max(1, len(seen.views) // _LOOKED_AT)]
+    some = seen.views[:: max(1, -(-len(seen.views) // _LOOKED_AT))]
     photos, views = photos_of(sources, [view.name for view in some], gray=True), {view.name: view for view in some}
     shown = size_that_is_shown(seen.board, [(photo, views[name]) for name, photo in photos.items()])
     if shown is None:
