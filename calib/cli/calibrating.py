@@ -259,29 +259,11 @@ def calibrate_camera(
         held_out=held_out,
         halves=halves,
         left_out=(*seen.left_out, *found.rejected_views),
-        findings=(
-            *_turned(seen, config),
-            *with_what_was_tried(
-                _findings(seen, found, plain if isinstance(by_view, Rejected) else by_view), lenses, shapes
-            ),
+        findings=with_what_was_tried(
+            _findings(seen, found, config, plain if isinstance(by_view, Rejected) else by_view), lenses, shapes
         ),
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
-    )
-
-
-def _turned(seen: Sightings, config: CalibrationConfig) -> Iterator[Finding]:
-    turned = turned_photos(seen.points3D, seen.views, config)
-    if turned is None:
-        return
-    named = ", ".join(turned.names[:_NAMED]) + (
-        f" and {len(turned.names) - _NAMED} more" if turned.names[_NAMED:] else ""
-    )
-    yield Finding(
-        "turned_photos",
-        f"{named}: turned by 180° in the file against the other photos; as they are the error is "
-        f"{turned.rms_px:.3f} px, with these turned back {turned.turned_back_rms_px:.3f} px",
-        "turn them back, or take the photos as the camera wrote them",
     )
 
 
@@ -309,10 +291,25 @@ def would_bring(rows: Sequence[RankedLens | RankedShape]) -> list[str]:
 
 
 def _findings(
-    seen: Sightings, found: Calibration, doubts: CalibrationCovariance | Rejected
+    seen: Sightings, found: Calibration, config: CalibrationConfig, doubts: CalibrationCovariance | Rejected
 ) -> tuple[Finding, ...]:  # fmt: skip
     """Of the corners all are looked at, whether they were left out or not: what they were left out for is a cause."""
     alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
     system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
     window = window_finding(system.observations, system.residuals())
-    return (*filter(None, [window]), *diagnose(found, doubts))
+    return (*_turned(seen, config), *filter(None, [window]), *diagnose(found, doubts))
+
+
+def _turned(seen: Sightings, config: CalibrationConfig) -> Iterator[Finding]:
+    turned = turned_photos(seen.points3D, seen.views, config)
+    if turned is None:
+        return
+    named = ", ".join(turned.names[:_NAMED]) + (
+        f" and {len(turned.names) - _NAMED} more" if turned.names[_NAMED:] else ""
+    )
+    yield Finding(
+        "turned_photos",
+        f"{named}: turned by 180° in the file against the other photos; as they are the error is "
+        f"{turned.rms_px:.3f} px, with these turned back {turned.turned_back_rms_px:.3f} px",
+        "turn them back, or take the photos as the camera wrote them",
+    )
