@@ -151,7 +151,10 @@ def test_an_interrupted_run_says_how_to_go_on(environment, tmp_path):
     for k in range(12):
         Image.fromarray(texture(k, (600, 800))).save(tmp_path / "photos" / f"{k}.png")
     command = [sys.executable, "-m", "sfm", "run", "photos", "-o", "ws", "--threads", "1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells have it ignored in the background
+    ) as process:  # fmt: skip
         assert process.stderr is not None
         for line in process.stderr:
             if line.startswith("features: 12 to do"):
