@@ -16,7 +16,7 @@ import dataclasses
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -96,16 +96,8 @@ def main() -> int:
 def trial(name: str, number: int) -> dict[str, Any]:
     """One calibration: errors of the parameters and their predicted deviations, the bend, what was seen."""
     cv2.setNumThreads(1)
-    case, rng = CASES[name], np.random.default_rng([len(name), number])
-    views, errors, wanted = [], [], 0
-    rays = Rays(case.camera)
-    for k in range(VIEWS):
-        photo, truth = held_before(case, rays, rng)
-        wanted += int(np.sum(np.all((truth > 3) & (truth < [case.camera.width - 3, case.camera.height - 3]), axis=1)))
-        seen = detect_board(photo, case.board, name=f"{k}")
-        if isinstance(seen, Detection):
-            views.append(BoardView(f"{k}", seen.width, seen.height, seen.corner_ids, seen.points2D))
-            errors.append(seen.points2D - truth[seen.corner_ids])
+    case = CASES[name]
+    views, errors, wanted = photographed(name, number)
     found = calibrate(
         case.board.points3D, views, CalibrationConfig(lens=case.lens, shape="paraboloid" if case.bend else "flat")
     )
@@ -120,6 +112,21 @@ def trial(name: str, number: int) -> dict[str, Any]:
         "sigma_by_view": sigmas[1] or None, "bend": float(found.shape.coefficients[1]) if case.bend else None,
         "rms": found.rms_px, "rejected": len(found.rejected_corners),
     }  # fmt: skip
+
+
+def photographed(name: str, number: int) -> tuple[list[BoardView], list[np.ndarray], int]:
+    """What the detector finds in a trial's photos: views, the errors (n, 2) of their corners, how many there were."""
+    case, rng = CASES[name], np.random.default_rng([len(name), number])
+    views, errors, wanted = [], [], 0
+    rays = rays_of(name)
+    for k in range(VIEWS):
+        photo, truth = held_before(case, rays, rng)
+        wanted += int(np.sum(np.all((truth > 3) & (truth < [case.camera.width - 3, case.camera.height - 3]), axis=1)))
+        seen = detect_board(photo, case.board, name=f"{k}")
+        if isinstance(seen, Detection):
+            views.append(BoardView(f"{k}", seen.width, seen.height, seen.corner_ids, seen.points2D))
+            errors.append(seen.points2D - truth[seen.corner_ids])
+    return views, errors, wanted
 
 
 def judged(case: Case, made: list[dict[str, Any]]) -> dict[str, Any]:
@@ -155,6 +162,12 @@ class Rays:
         y, x = (np.mgrid[: camera.height * PARTS, : camera.width * PARTS] + 0.5) / PARTS
         rays, self.seen = camera.unproject(np.column_stack([x.ravel(), y.ravel()]))
         self.rays, self.seen = rays.reshape(*x.shape, 3), self.seen.reshape(x.shape)
+
+
+@cache
+def rays_of(name: str) -> Rays:
+    """Once in a process."""
+    return Rays(CASES[name].camera)
 
 
 def held_before(case: Case, rays: Rays, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
