@@ -14,9 +14,10 @@ from typing import cast
 import numpy as np
 
 from calib.boards import Board
-from calib.cli.calibrating import CalibratedCamera, CameraPlan, Sightings, calibrate_camera, see_board
+from calib.cli.calibrating import CalibratedCamera, CameraPlan, calibrate_camera
 from calib.cli.parsing import board_of
 from calib.cli.refusals import no_camera
+from calib.cli.sightings import Sightings, see_board
 from calib.refine_board import SHAPES, ShapeKind
 from calib.refine_lenses import lens_called
 from calib.uncertainty import pixel_grid, projection_difference

@@ -84,11 +84,12 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CameraOptions, "camera", words, EXAMPLES)
     board = _checked(options)
 
-    from calib.cli.calibrating import calibrate_camera, see_board
+    from calib.cli.calibrating import calibrate_camera
     from calib.cli.camera_report import camera_json, camera_lines, record_of
     from calib.cli.next_photos import drawn, next_photos
     from calib.cli.progress import kernels_announced, told
     from calib.cli.refusals import no_camera, shown_size
+    from calib.cli.sightings import see_board
     from sfm.io.atomic import write_text
     from sfm.io.camera_files import write_camera_toml
 

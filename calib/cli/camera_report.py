@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from calib import __version__
-from calib.cli.calibrating import CalibratedCamera, Sightings, would_bring
+from calib.cli.calibrating import CalibratedCamera, would_bring
+from calib.cli.sightings import Sightings
 from calib.cli.suggestions_text import suggestion_lines, suggestions_json
 from calib.next_views import SuggestedView
 from calib.refine import Calibration

@@ -17,7 +17,7 @@ from sfm.core.errors import ConfigError, ExitCode, InputError, Rejected
 if TYPE_CHECKING:
     from calib.boards import Board
     from calib.check import CameraCheck
-    from calib.cli.calibrating import Sightings
+    from calib.cli.sightings import Sightings
     from sfm.core.cameras import Camera
     from sfm.io.camera_records import CameraRecord
 
@@ -71,11 +71,11 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CheckOptions, "check", words, EXAMPLES)
     _check_options(options)
 
-    from calib.cli.calibrating import see_board
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
     from calib.cli.refusals import no_check, shown_size
+    from calib.cli.sightings import see_board
     from calib.cli.suggestions_svg import suggestions_svg
     from sfm.io.atomic import write_text
 

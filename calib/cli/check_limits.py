@@ -16,7 +16,7 @@ import numpy as np
 from calib.boards import Board
 from calib.boards_text import parse_board
 from calib.check import known_shape
-from calib.cli.calibrating import Sightings
+from calib.cli.sightings import Sightings
 from calib.refine_board import BoardShape
 from sfm.core.arrays import Points3D
 from sfm.core.errors import ConfigError, FormatError

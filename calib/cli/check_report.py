@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from calib.check import GRAVE, CameraCheck
-from calib.cli.calibrating import Sightings
+from calib.cli.sightings import Sightings
 from calib.cli.suggestions_text import suggestion_lines, suggestions_json
 from calib.next_views import SuggestedView
 from sfm.io.camera_records import CameraRecord

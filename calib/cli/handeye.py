@@ -85,11 +85,11 @@ def main(words: Sequence[str]) -> int:
     board = board_of(options.board)
 
     from calib.board_turns import board_turns
-    from calib.cli.calibrating import see_board
     from calib.cli.handeye_report import hand_eye_json, hand_eye_lines, hand_eye_toml
     from calib.cli.progress import kernels_announced, told
     from calib.cli.refusals import no_board
     from calib.cli.robot_poses import poses_of_photos, read_robot_poses
+    from calib.cli.sightings import see_board
     from calib.hand_eye import HandEyeConfig, calibrate_hand_eye
     from sfm.io.atomic import check_writable, write_text
     from sfm.io.camera_files import read_intrinsics

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.cli.calibrating import CalibratedCamera, Sightings
+from calib.cli.calibrating import CalibratedCamera
+from calib.cli.sightings import Sightings
 from calib.cli.suggestions_svg import suggestions_svg
 from calib.next_views import SuggestedView, camera_uncertainty, suggest_views
 from calib.refine import Calibration

@@ -20,7 +20,8 @@ import numpy as np
 
 import calib
 from calib.boards import Board
-from calib.detect import DetectConfig, Detection, detect_board
+from calib.detect import Detection, detect_board
+from calib.detect_gates import DetectConfig
 from sfm.core.arrays import ImageU8
 from sfm.core.errors import ConfigError, ImageError, InputError, Rejected
 from sfm.core.events import SILENT, ImageRead, Observer, StageFinished, StageStarted

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from calib.board_extent import size_that_is_shown
-from calib.cli.calibrating import Sightings
 from calib.cli.other_boards import board_that_is_shown
 from calib.cli.photos import find_photos, photos_of
+from calib.cli.sightings import Sightings
 from calib.diagnose import Finding
 from sfm.core.errors import InputError, ReconstructionError, Rejected, SfmError
 

@@ -13,11 +13,11 @@ import numpy as np
 from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.again import SAME_PX, difference_px
-from calib.cli.calibrating import Sightings
 from calib.cli.parsing import board_of
 from calib.cli.rig_options import expanded, named_sources
 from calib.cli.rig_report import GIVEN
 from calib.cli.rigging import lens_of, rig_refused, see_rig
+from calib.cli.sightings import Sightings
 from calib.refine_board import SHAPES, ShapeKind
 from calib.refine_lenses import lens_called
 from calib.rig_frames import PAIRINGS, FrameTable, Pairing

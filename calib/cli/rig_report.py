@@ -12,7 +12,7 @@ import numpy as np
 
 from calib import __version__
 from calib.boards import Board
-from calib.cli.calibrating import Sightings
+from calib.cli.sightings import Sightings
 from calib.rig_epipolar import EpipolarErrors, epipolar_errors
 from calib.rig_frames import FrameTable
 from calib.rig_result import RigCalibration

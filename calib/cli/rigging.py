@@ -11,7 +11,7 @@ from sfm.core.errors import ExitCode, ReconstructionError, Rejected
 
 if TYPE_CHECKING:
     from calib.boards import Board
-    from calib.cli.calibrating import Sightings
+    from calib.cli.sightings import Sightings
     from calib.rig_frames import FrameTable
     from calib.rig_shapes import RankedRig
     from calib.rig_views import RigCamera
@@ -64,9 +64,9 @@ def see_rig(
     Raises:
         ReconstructionError: photos cannot be paired.
     """
-    from calib.cli.calibrating import see_board
     from calib.cli.progress import told
     from calib.cli.refusals import no_board
+    from calib.cli.sightings import see_board
     from calib.rig_frames import pair_photos
 
     seen = {

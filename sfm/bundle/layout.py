@@ -1,9 +1,8 @@
 """The order in which kernels see a problem.
 
 What is left after the elimination of points comes in rows of six (`sfm.core.optim.block_pattern`): first the poses of
-frames that may move, then *shared rows*: the free parameters of each camera, six to a row, the poses of sensors that
-may move on their rig, and the biases of priors. A frame is what moves as one: the images of one moment of a rig, or
-a single image.
+frames that may move, then *shared rows*, which several images have: cameras, sensors on a rig, biases (see
+`shared_rows`). A frame is what moves as one: the images of one moment of a rig, or a single image.
 
 Observations are kept in two orders. By images they are evaluated, many at once. By points, and within a point by the
 row (`slot`) of their frame, they are eliminated; those of frames that do not move come first there, with slot −1.
@@ -20,9 +19,8 @@ import math
 import numpy as np
 
 from sfm.bundle import _layout_kernels as kernels
-from sfm.bundle.prior_terms import bias_count
 from sfm.bundle.problem import BundleProblem
-from sfm.core.cameras._kernels import MAX_PARAMS
+from sfm.bundle.shared_rows import SharedRows, columns_of_images, rows_of_images, shared_couplings, shared_rows
 from sfm.core.execution import chunk_bounds
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 
@@ -30,29 +28,6 @@ _OBSERVATIONS_PER_CHUNK, _MAX_CHUNKS = 16384, 16
 """At most, and chunks are a power of two: three would keep one of two threads waiting."""
 _OWN_WORK, _NARROW_WORK = 4.0, 0.6
 """What a coupling takes beside its products with others, and what a product of three rows takes instead of six."""
-SENSOR_COLUMN = MAX_PARAMS
-"""Where the six columns of a sensor's tangent begin, behind those of the parameters."""
-BIAS_COLUMN = SENSOR_COLUMN + BLOCK
-"""Where the three of a bias begin."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class SharedRows:
-    """Rows behind those of poses, T of them.
-
-    Attributes:
-        camera, sensor, bias: (T,) whose row it is, −1 in the two others.
-        columns: (T, 6) index of the parameter in each place, −1 for padding; sensors have `SENSOR_COLUMN` and on,
-            biases `BIAS_COLUMN` and on.
-    """
-
-    camera: np.ndarray
-    sensor: np.ndarray
-    bias: np.ndarray
-    columns: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.camera)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -184,10 +159,10 @@ def lay_out(problem: BundleProblem, active: np.ndarray) -> Layout:
     position = np.empty(len(active), np.int32)
     position[by_point] = np.arange(len(by_point), dtype=np.int32)
 
-    shared = _shared_rows(problem, seen)
-    image_shared = _rows_of_images(problem, shared, len(slot_frame))
-    columns, column_place, column_count = _columns(shared, image_shared - len(slot_frame))
-    obs_shared, shared_point, shared_slot = _shared_couplings(
+    shared = shared_rows(problem, seen)
+    image_shared = rows_of_images(problem, shared, len(slot_frame))
+    columns, column_place, column_count = columns_of_images(shared, image_shared - len(slot_frame))
+    obs_shared, shared_point, shared_slot = shared_couplings(
         point, image_shared.take(image, axis=0), problem.free_points, len(slot_frame) + len(shared)
     )
     couples = (slots >= 0) & _changes(point, slots)
@@ -243,71 +218,6 @@ def _changes(point: np.ndarray, slots: np.ndarray) -> np.ndarray:
     first = np.ones(len(point), bool)
     first[1:] = (point[1:] != point[:-1]) | (slots[1:] != slots[:-1])
     return first
-
-
-def _shared_rows(problem: BundleProblem, seen: np.ndarray) -> SharedRows:
-    """Rows for the cameras and sensors that have something free and that an observation sees, and for biases."""
-    used = np.bincount(problem.image_cameras[seen], minlength=len(problem.model_ids)) > 0
-    owners, columns = [], []
-    for c in np.flatnonzero(used & problem.free_params.any(axis=1)):
-        free = np.flatnonzero(problem.free_params[c])
-        for k in range(0, len(free), BLOCK):
-            owners.append((c, -1, -1))
-            columns.append(np.pad(free[k : k + BLOCK], (0, max(k + BLOCK - len(free), 0)), constant_values=-1))
-    if problem.rigs is not None:
-        mounted = problem.rigs.image_sensors[seen]
-        used = np.bincount(mounted[mounted >= 0], minlength=len(problem.rigs.free_sensors)) > 0
-        for q in np.flatnonzero(used & problem.rigs.free_sensors):
-            owners.append((-1, q, -1))
-            columns.append(SENSOR_COLUMN + np.arange(BLOCK))
-    for b in range(bias_count(problem.pose_priors)):
-        owners.append((-1, -1, b))
-        columns.append(np.array([BIAS_COLUMN, BIAS_COLUMN + 1, BIAS_COLUMN + 2, -1, -1, -1]))
-    camera, sensor, bias = np.array(owners, np.int32).reshape(-1, 3).T
-    return SharedRows(camera, sensor, bias, np.array(columns, np.int32).reshape(-1, BLOCK))
-
-
-def _rows_of_images(problem: BundleProblem, shared: SharedRows, poses: int) -> np.ndarray:
-    """(I, m) the numbers of the shared rows of each image, ascending, −1 for none."""
-    owned: list[list[int]] = [[] for _ in problem.model_ids]
-    mounted: list[list[int]] = [[] for _ in (problem.rigs.free_sensors if problem.rigs else [])]
-    for k, (c, q) in enumerate(zip(shared.camera, shared.sensor, strict=True)):
-        if c >= 0 or q >= 0:
-            (owned[c] if c >= 0 else mounted[q]).append(poses + k)
-    sensors = problem.rigs.image_sensors if problem.rigs else np.full(len(problem.image_cameras), -1)
-    rows = [owned[c] + (mounted[q] if q >= 0 else []) for c, q in zip(problem.image_cameras, sensors, strict=True)]
-    out = np.full((len(rows), max(map(len, rows), default=0)), -1, np.int32)
-    for i, mine in enumerate(rows):
-        out[i, : len(mine)] = mine
-    return out
-
-
-def _columns(shared: SharedRows, image_shared: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Free columns of each image and their places among those of its shared rows (I, k), and their count (I,)."""
-    padded = np.concatenate([shared.columns, np.full((1, BLOCK), -1, np.int32)])
-    size = image_shared.shape[1] * BLOCK
-    everything = padded[np.where(image_shared >= 0, image_shared, -1)].reshape(len(image_shared), size)
-    place = np.argsort(everything < 0, axis=1, kind="stable").astype(np.int32)
-    count = np.sum(everything >= 0, axis=1).astype(np.int32)
-    place = np.ascontiguousarray(place[:, : int(count.max(initial=0))])
-    return np.take_along_axis(everything, place, axis=1), place, count
-
-
-def _shared_couplings(
-    point: np.ndarray, rows: np.ndarray, free_points: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The couplings of each observation (n, m), −1 for none, and point and row of each coupling."""
-    coupling = np.full(rows.shape, -1, np.int32)
-    takes_part = (rows >= 0) & free_points[point][:, None]
-    keys = (point.astype(np.int64)[:, None] * max(count, 1) + rows)[takes_part]
-    if len(keys) and np.all(keys[:-1] <= keys[1:]):
-        first = np.ones(len(keys), bool)
-        first[1:] = keys[1:] != keys[:-1]
-        unique, inverse = keys[first], np.cumsum(first) - 1
-    else:
-        unique, inverse = np.unique(keys, return_inverse=True)
-    coupling[takes_part] = inverse
-    return coupling, unique // max(count, 1), (unique % max(count, 1)).astype(np.int32)
 
 
 def _offsets(point: np.ndarray, points: int) -> np.ndarray:

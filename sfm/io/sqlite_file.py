@@ -78,6 +78,14 @@ class SqliteFile:
         else:
             self._execute(f"DELETE FROM {table} WHERE {column} = ?", (value,))
 
+    @contextlib.contextmanager
+    def _reading(self, what: str) -> Iterator[None]:
+        """Turns the refusal of a value's constructor into one that names the file."""
+        try:
+            yield
+        except (ValueError, TypeError) as error:
+            raise FormatError(f"{what} cannot be read: {error}", path=self.path) from error
+
 
 def connect(path: Path, options: str) -> sqlite3.Connection:
     """A connection without implicit transactions; `options` as in an SQLite URI, e.g. `mode=ro`."""

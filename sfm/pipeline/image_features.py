@@ -20,7 +20,7 @@ from sfm.core.cameras import Camera
 from sfm.core.errors import ConfigError, ImageError, Rejected
 from sfm.core.scene import Features
 from sfm.features import NETWORKS, FeatureConfig, Frame, descriptor_kind, extract, reduced_image, track_features
-from sfm.io.database import Decision
+from sfm.io.bookkeeping import Decision
 from sfm.io.images import read_image
 from sfm.io.masks import masked_share, read_mask
 from sfm.pipeline.config import PipelineConfig

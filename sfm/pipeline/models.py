@@ -9,8 +9,8 @@ from pathlib import Path
 from sfm.core.events import Event, ImageRegistered, StageFinished, StageStarted
 from sfm.core.scene import Reconstruction, ViewGraph
 from sfm.io.atomic import replace_folders
+from sfm.io.bookkeeping import Decision
 from sfm.io.colmap_model import model_format, read_model, write_model
-from sfm.io.database import Decision
 from sfm.io.images import read_image
 from sfm.mapping import map_incrementally
 from sfm.pipeline.colors import colorize

@@ -15,7 +15,7 @@ from sfm.core.errors import ConfigError
 from sfm.core.events import Note
 from sfm.core.scene import DescriptorKind
 from sfm.features import descriptor_kind
-from sfm.io.database import Decision
+from sfm.io.bookkeeping import Decision
 from sfm.io.exif import read_image_info
 from sfm.io.images import natural_key
 from sfm.io.pair_list import read_pair_list

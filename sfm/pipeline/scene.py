@@ -18,8 +18,9 @@ from sfm.core.cameras.priors import infer_camera
 from sfm.core.errors import ImageError, InputError
 from sfm.core.events import ImageRead, Note, Observer, StageFinished, StageStarted
 from sfm.core.execution import ordered_map
+from sfm.io.bookkeeping import Decision, ImageSource
 from sfm.io.camera_files import camera_names, read_intrinsics
-from sfm.io.database import Database, Decision, ImageSource
+from sfm.io.database import Database
 from sfm.io.exif import ImageInfo, prior_focal_px, read_image_info
 from sfm.io.images import check_size, list_images, read_image_bytes
 from sfm.io.masks import check_mask_size, find_masks, masks_folder, photos_among

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from sfm.bundle import _kernels as kernels
-from sfm.bundle.layout import SENSOR_COLUMN, Layout, lay_out
+from sfm.bundle.layout import Layout, lay_out
 from sfm.bundle.problem import BundleProblem
 from sfm.bundle.rig_arrays import RigArrays
+from sfm.bundle.shared_rows import SENSOR_COLUMN
 from sfm.core.cameras._kernels import MAX_PARAMS, project_with_jacobians
 from sfm.core.cameras._lane_kernels import LANES
 from sfm.core.geometry.rigid import Rigid3

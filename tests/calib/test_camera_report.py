@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from calib.boards import chessboard
-from calib.cli.calibrating import CalibratedCamera, CameraPlan, Sightings, calibrate_camera
+from calib.cli.calibrating import CalibratedCamera, CameraPlan, calibrate_camera
 from calib.cli.camera_report import camera_json, camera_lines, record_of
 from calib.cli.next_photos import further_photos, next_photos
+from calib.cli.sightings import Sightings
 from calib.uncertainty import rms_uncertainty
 from sfm.core.errors import Rejected
 from tests.calib.boards_in_space import LENS, poses_before, seen, with_corners

@@ -10,8 +10,8 @@ import pytest
 
 from calib.boards import Board, chessboard
 from calib.check import check_camera, known_shape
-from calib.cli.calibrating import Sightings
 from calib.cli.check_limits import board_of_record, limit_of, shapes_to_try
+from calib.cli.sightings import Sightings
 from sfm.core.errors import FormatError, Rejected
 from sfm.io.camera_records import BoardRecord, CameraRecord
 from tests.calib.boards_in_space import LENS, poses_before, seen

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from calib.boards import aprilgrid, asymmetric_circle_grid, charuco, chessboard, circle_grid
-from calib.detect import DetectConfig, Detection, detect_board
+from calib.detect import Detection, detect_board
 from calib.detect_circles import centre_shifts, curvature_shifts
+from calib.detect_gates import DetectConfig
 from calib.detect_neighbours import local_affines, predicted
 from calib.detect_overlay import overlay
 from datasets.synthetic import boards as views

@@ -7,8 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.diagnose import board_tilts, coverage, diagnose, whiteness
+from calib.coverage import coverage
+from calib.diagnose import board_tilts, diagnose
 from calib.refine import CalibrationConfig, calibrate
+from calib.whiteness import whiteness
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3

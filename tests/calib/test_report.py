@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from calib import report_figures as figures
 from calib import report_svg as svg
-from calib.cli.calibrating import CameraPlan, Sightings, calibrate_camera
+from calib.cli.calibrating import CameraPlan, calibrate_camera
 from calib.cli.report_page import report_page, worst_views
+from calib.cli.sightings import Sightings
 from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_reject import RejectedView
 from calib.uncertainty import covariance

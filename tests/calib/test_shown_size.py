@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from calib.boards import Board, chessboard
-from calib.cli.calibrating import Sightings
 from calib.cli.refusals import shown_size
+from calib.cli.sightings import Sightings
 from calib.refine_views import BoardView
 from datasets.synthetic.boards import PINHOLE, pose, render
 from sfm.core.errors import InputError

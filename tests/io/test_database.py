@@ -18,7 +18,11 @@ from sfm.core.cameras import COLMAP_MODELS, Camera
 from sfm.core.errors import FormatError, InputError, Rejected, WorkspaceLockedError
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import DescriptorKind, Features, Matches, PairKind, TwoViewGeometry
-from sfm.io.database import Database, Decision, ImageRow, ImageSource, as_stored, pair_id, pair_of
+from sfm.io.bookkeeping import Decision, ImageSource
+from sfm.io.database import Database
+from sfm.io.database_features import as_stored
+from sfm.io.database_images import ImageRow
+from sfm.io.database_pairs import pair_id, pair_of
 
 CAMERA = Camera("SIMPLE_RADIAL", 640, 480, np.array([500.0, 320.0, 240.0, 0.1]), has_prior_focal_length=True)
 

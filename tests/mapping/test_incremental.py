@@ -10,8 +10,9 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.similarity import Sim3, estimate_similarity
 from sfm.core.scene import PairKind, TwoViewGeometry, ViewGraph
 from sfm.mapping import MappingConfig, build_tracks, map_incrementally
-from sfm.mapping.incremental import _Mapper
+from sfm.mapping.refinement import drop_misplaced_images, triangulate_seen_by
 from sfm.mapping.state import Scene, State
+from sfm.mapping.task import MappingTask
 from tests.mapping.scenes import PointScene, look_at
 
 
@@ -84,16 +85,16 @@ def test_an_image_that_disagrees_with_what_it_should_see_is_misplaced():
     scene, events = PointScene(noise_px=0.3), []
     tracks = build_tracks(scene.view_graph, scene.keypoints, min_length=2)
     rows = Scene.build(tracks, scene.keypoints, scene.cameras, scene.image_cameras, scene.image_names)
-    mapper = _Mapper(rows, scene.view_graph, MappingConfig(), 0, 1, False, events.append)
+    task = MappingTask(rows, scene.view_graph, MappingConfig(), 0, 1, False, events.append)
     state = State.start(rows)
     for row, pose in enumerate(scene.poses):
         state.set_pose(row, pose)
-    mapper.triangulate_seen_by(state, np.arange(8))
-    assert not mapper.drop_misplaced_images(state)
+    triangulate_seen_by(task, state, np.arange(8))
+    assert not drop_misplaced_images(task, state)
     # What image 3 sees no longer fits, but for one in ten: its own points, as a false pair would have made them.
     mine = rows.observations_of(2)
     state.on[mine[40:]] = False
-    assert mapper.drop_misplaced_images(state)
+    assert drop_misplaced_images(task, state)
     assert not state.registered[2]
     assert not state.on[mine].any()
     assert state.registered.sum() == 7
