@@ -47,7 +47,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from calib.refine import Calibration
-from calib.uncertainty_corners import Parts, by_corner, scaled_inverse
+from calib.uncertainty_corners import (
+    corner_derivatives,
+    corner_scores,
+    jackknife,
+    scaled_inverse,
+    share_kept,
+    whitened_lengths,
+)
 from sfm.core.arrays import FloatArray, Points2D, Value, Vector, readonly
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -99,14 +106,14 @@ def covariance(
         `undetermined_parameters` where the views leave a parameter open.
     """
     parts = _parts(calibration)
-    sigma = scaled_inverse(parts.S)
+    sigma = scaled_inverse(parts.reduced.sum(0))
     if sigma is None:
         return Rejected("undetermined_parameters", "the views leave a combination of parameters open")
     variance = calibration.sigma_px**2
     if by_view:
-        shared = _jackknife(parts)
+        shared = jackknife(parts.reduced, parts.scores)
     else:
-        shared = variance * sigma if alike else by_corner(calibration, parts, sigma)
+        shared = variance * sigma if alike else _by_corner(calibration, parts, sigma)
     if shared is None:
         return Rejected("undetermined_parameters", "without one of the views a combination of parameters is open")
     solved = np.linalg.solve(parts.H, parts.W)
@@ -198,23 +205,44 @@ def projection_difference(
     return np.where((valid & seen)[:, None], pixels - points2D, np.nan)
 
 
-def _parts(calibration: Calibration) -> Parts:
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """Of each view: H (6, 6), W (6, K), what it adds to S (K, K) and to the gradient (K,) with its pose eliminated."""
+
+    H: FloatArray
+    W: FloatArray
+    reduced: FloatArray
+    scores: FloatArray
+
+
+def _parts(calibration: Calibration) -> _Parts:
     blocks = np.tril(calibration.system().blocks)
     blocks = blocks + np.tril(blocks, -1).swapaxes(1, 2)
     H, W, A = blocks[:, :6, :6], blocks[:, :6, 6:-1], blocks[:, 6:-1, 6:-1]
     solved = np.linalg.solve(H, W)
     reduced = A - W.swapaxes(1, 2) @ solved
     scores = blocks[:, 6:-1, -1] - np.einsum("vik,vi->vk", solved, blocks[:, :6, -1])
-    return Parts(H, W, reduced, scores)
+    return _Parts(H, W, reduced, scores)
 
 
-def _jackknife(parts: Parts) -> FloatArray | None:
-    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ."""
-    S, steps = parts.S, []
-    for reduced, score in zip(parts.reduced, parts.scores, strict=True):
-        inverse = scaled_inverse(S - reduced)
-        if inverse is None:
-            return None
-        steps.append(inverse @ score)
-    apart = np.array(steps) - np.mean(steps, axis=0)
-    return (len(steps) - 1) / len(steps) * apart.T @ apart
+def _by_corner(calibration: Calibration, parts: _Parts, sigma: FloatArray) -> FloatArray:
+    """HC2, view by view; with what rejection has hidden."""
+    observations, shape, meat = calibration.observations, calibration.shape, np.zeros_like(sigma)
+    for v, inverse in enumerate(np.linalg.inv(parts.H)):
+        part = slice(observations.offsets[v], observations.offsets[v + 1])
+        rows = observations.rows[part]
+        by = corner_derivatives(
+            calibration.camera, calibration.columns, calibration.cams_from_board[v],
+            observations.board[rows] + shape.displacements[rows], shape.basis[rows],
+            observations.roots[part], calibration.residuals[part],
+        )  # fmt: skip
+        by_shared = np.concatenate([by.by_params, by.by_shape], axis=2)
+        scores = corner_scores(by.by_pose, by_shared, by.residuals, inverse, parts.W[v], sigma)
+        meat += scores.T @ scores
+    return sigma @ meat @ sigma / _share_kept(calibration) ** 2
+
+
+def _share_kept(calibration: Calibration) -> float:
+    if not calibration.rejected_corners:
+        return 1.0
+    return share_kept(whitened_lengths(calibration.observations, calibration.residuals))

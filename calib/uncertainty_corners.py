@@ -1,4 +1,14 @@
-"""What a calibration's corners say of its uncertainty, each by its own residual; see `uncertainty`."""
+"""What the corners of photos say of the uncertainty of what photos share, each by its own residual; see `uncertainty`.
+
+A corner i has D_i (2, K), the derivatives by what is shared with those by the pose of its photo (or of its moment, in a
+rig) projected out,
+
+    D_i = J_i − P_i H⁻¹ W,      h_i = P_i H⁻¹ P_iᵀ + D_i Σ D_iᵀ
+
+with P_i (2, 6) by the pose, J_i (2, K) by what is shared, and H, W, Σ of the normal equations. The covariance is
+
+    Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ / share²,      r_i = (I − h_i)^−½ e_i
+"""
 
 from __future__ import annotations
 
@@ -6,8 +16,11 @@ import dataclasses
 
 import numpy as np
 
-from calib.refine import Calibration, CalibrationConfig
-from sfm.core.arrays import FloatArray
+from calib.refine_fit import CalibrationConfig
+from calib.refine_views import Observations
+from sfm.core.arrays import FloatArray, Points3D, Vector
+from sfm.core.cameras import Camera
+from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import skew
 
 _LEAST_FREEDOM = 1e-3
@@ -18,18 +31,70 @@ _MEDIAN_LENGTH = 1.17741
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Parts:
-    """Of each view: H (6, 6), W (6, K), what it adds to S (K, K) and to the gradient (K,) with its pose eliminated."""
+class CornerDerivatives:
+    """Of the n corners of a view, whitened: by the pose (n, 2, 6), the camera's free parameters (n, 2, k), the board's
+    coefficients (n, 2, B), and residuals (n, 2)."""
 
-    H: FloatArray
-    W: FloatArray
-    reduced: FloatArray
-    scores: FloatArray
+    by_pose: FloatArray
+    by_params: FloatArray
+    by_shape: FloatArray
+    residuals: FloatArray
 
-    @property
-    def S(self) -> FloatArray:
-        """(K, K) of all views."""
-        return self.reduced.sum(0)
+
+def corner_derivatives(
+    camera: Camera, columns: np.ndarray, cam_from_board: Rigid3, points3D: Points3D, basis: FloatArray,
+    roots: FloatArray, residuals: FloatArray,
+) -> CornerDerivatives:  # fmt: skip
+    """Of one view; what is not seen counts nothing.
+
+    Args:
+        columns: positions of the free parameters.
+        points3D: (n, 3) of the corners, in the board's frame, as it is bent.
+        basis: (n, 3, B) by which the board's coefficients move them.
+        roots: (n, 3) of the corners' weights, and residuals (n, 2) in px; see `Observations`.
+    """
+    points = cam_from_board @ points3D
+    _, by_point, by_params, _ = camera.project_with_jacobians(points)
+    a, b, c = roots.T
+    whiten = np.stack([np.stack([a, b], -1), np.stack([np.zeros_like(c), c], -1)], -2)
+    by_pose = np.concatenate([-by_point @ skew(points), by_point], axis=2)
+    by_shape = by_point @ cam_from_board.rotation.matrix @ basis
+    return CornerDerivatives(
+        by_pose=np.nan_to_num(whiten @ by_pose),
+        by_params=np.nan_to_num(whiten @ by_params[:, :, columns]),
+        by_shape=np.nan_to_num(whiten @ by_shape),
+        residuals=np.einsum("nij,nj->ni", whiten, np.nan_to_num(residuals)),
+    )
+
+
+def corner_scores(
+    by_pose: FloatArray, by_shared: FloatArray, residuals: FloatArray, inverse: FloatArray, W: FloatArray,
+    sigma: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """(n, K) the rows (D_iᵀ r_i)ᵀ of corners with one pose.
+
+    Args:
+        by_pose: P (n, 2, 6); by_shared: J (n, 2, K); residuals: e (n, 2), all of them whitened.
+        inverse: H⁻¹ (6, 6) of the pose; W: (6, K); sigma: Σ (K, K), with unit noise.
+    """
+    D = by_shared - by_pose @ (inverse @ W)
+    leverages = by_pose @ inverse @ by_pose.swapaxes(1, 2) + D @ sigma @ D.swapaxes(1, 2)
+    values, vectors = np.linalg.eigh(np.eye(2) - leverages)
+    roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
+    return np.einsum("nik,nij,nj->nk", D, roots, residuals)
+
+
+def whitened_lengths(observations: Observations, residuals: FloatArray) -> Vector:
+    """(n,) of residuals in px; 0 of what is not seen."""
+    a, b, c = observations.roots.T
+    u, v = np.nan_to_num(residuals).T
+    return np.hypot(a * u + b * v, c * v)
+
+
+def share_kept(lengths: Vector) -> float:
+    """1 − ½ c ρ where corners were rejected, with ρ from the lengths between 0.8 c and c."""
+    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
+    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
 
 
 def scaled_inverse(S: FloatArray) -> FloatArray | None:
@@ -43,44 +108,17 @@ def scaled_inverse(S: FloatArray) -> FloatArray | None:
     return (vectors / values) @ vectors.T / np.outer(root, root)
 
 
-def by_corner(calibration: Calibration, parts: Parts, sigma: FloatArray) -> FloatArray:
-    """HC2, view by view; with what rejection has hidden."""
-    observations, meat = calibration.observations, np.zeros_like(sigma)
-    for v, inverse in enumerate(np.linalg.inv(parts.H)):
-        rows = slice(observations.offsets[v], observations.offsets[v + 1])
-        by_pose, by_shared, residuals = _whitened_derivatives(calibration, v, rows)
-        D = by_shared - by_pose @ (inverse @ parts.W[v])
-        leverages = by_pose @ inverse @ by_pose.swapaxes(1, 2) + D @ sigma @ D.swapaxes(1, 2)
-        values, vectors = np.linalg.eigh(np.eye(2) - leverages)
-        roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
-        scores = np.einsum("nik,nij,nj->nk", D, roots, residuals)
-        meat += scores.T @ scores
-    return sigma @ meat @ sigma / _share_kept(calibration) ** 2
+def jackknife(reduced: FloatArray, scores: FloatArray) -> FloatArray | None:
+    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ, of views or moments that are left out in turn; None where one cannot be.
 
-
-def _whitened_derivatives(calibration: Calibration, v: int, rows: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of the corners of a view: (n, 2, 6) by its pose, (n, 2, K) by what views share, and (n, 2) residuals."""
-    observations, shape = calibration.observations, calibration.shape
-    pose = calibration.cams_from_board[v]
-    at = observations.rows[rows]
-    points = pose @ (observations.board[at] + shape.displacements[at])
-    _, by_point, by_params, _ = calibration.camera.project_with_jacobians(points)
-    by_pose = np.concatenate([-by_point @ skew(points), by_point], axis=2)
-    by_shared = by_params[:, :, calibration.columns]
-    if len(shape.coefficients):
-        by_shared = np.concatenate([by_shared, by_point @ pose.rotation.matrix @ shape.basis[at]], axis=2)
-    a, b, c = observations.roots[rows].T
-    roots = np.stack([np.stack([a, b], -1), np.stack([np.zeros_like(c), c], -1)], -2)
-    residuals = np.einsum("nij,nj->ni", roots, np.nan_to_num(calibration.residuals[rows]))
-    return np.nan_to_num(roots @ by_pose), np.nan_to_num(roots @ by_shared), residuals
-
-
-def _share_kept(calibration: Calibration) -> float:
-    """1 − ½ c ρ, with ρ from the lengths between 0.8 c and c; 1 where none was rejected."""
-    if not calibration.rejected_corners:
-        return 1.0
-    a, b, c = calibration.observations.roots.T
-    u, v = np.nan_to_num(calibration.residuals).T
-    lengths = np.hypot(a * u + b * v, c * v)
-    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
-    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
+    Args:
+        reduced: (V, K, K) what each adds to S, scores: (V, K) and to the gradient, with its pose eliminated.
+    """
+    S, steps = reduced.sum(0), []
+    for part, score in zip(reduced, scores, strict=True):
+        inverse = scaled_inverse(S - part)
+        if inverse is None:
+            return None
+        steps.append(inverse @ score)
+    apart = np.array(steps) - np.mean(steps, axis=0)
+    return (len(steps) - 1) / len(steps) * apart.T @ apart
