@@ -19,9 +19,9 @@ from calib.diagnose import Finding, diagnose_photos
 from calib.diagnose_window import stated_finding, window_finding
 from calib.refine import Calibration
 from calib.refine_board import BoardShape
-from calib.refine_reject import RejectedView, without_copies
+from calib.refine_copies import without_copies
 from calib.refine_system import CalibrationSystem
-from calib.refine_views import BoardView, gather
+from calib.refine_views import BoardView, RejectedView, gather
 from calib.uncertainty import covariance
 from calib.uncertainty_holdout import fit_poses, read_as_suits
 from sfm.core.arrays import Points3D, Value
@@ -94,7 +94,7 @@ def check_camera(
     Returns:
         `no_views` where none can be used, with the reason of the first.
     """
-    usable, left_out = _sorted_out(camera, views)
+    usable, left_out = _sorted_out(camera, views, turns)
     observations, _ = read_as_suits(camera, shape, gather(shape.given, usable), turns)
     system, seen = fit_poses(camera, shape, observations)
     left_out += [
@@ -130,8 +130,10 @@ def _perhaps_of_corners(finding: Finding) -> Finding:
     return dataclasses.replace(finding, remedy=f"it may be those corners; if not, {finding.remedy}")
 
 
-def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
-    views, left_out = without_copies(views)
+def _sorted_out(
+    camera: Camera, views: Sequence[BoardView], turns: Sequence[BoardTurn]
+) -> tuple[list[BoardView], list[RejectedView]]:
+    views, left_out = without_copies(views, turns)
     usable = []
     for view in views:
         if (view.width, view.height) != (camera.width, camera.height):

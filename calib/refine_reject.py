@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
+from calib.refine_copies import without_copies
 from calib.refine_fit import ROBUST, CalibrationConfig, Fit
 from calib.refine_system import CalibrationSystem
-from calib.refine_views import BoardView, Observations, gather
+from calib.refine_views import BoardView, Observations, RejectedView, gather
 from calib.zhang import Homographies, fit_view_homographies
 from sfm.core.arrays import BoolArray, FloatArray, Vector
 from sfm.core.geometry.homogeneous import transform_points
@@ -31,29 +31,6 @@ eleven sets stay below 3.2 times; with the best fitting board below 0.25 px, whe
 _ROUNDS = 8
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class RejectedView:
-    """A view that is left out, and why."""
-
-    name: str
-    reason: str
-    detail: str = ""
-
-
-def without_copies(views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
-    """A photo that is there twice would count twice: the first one stays, the others are `copy_of` it."""
-    first: dict[bytes, str] = {}
-    kept, copies = [], []
-    for view in views:
-        key = view.corner_ids.tobytes() + view.points2D.tobytes()
-        if key in first:
-            copies.append(RejectedView(view.name, f"copy_of {first[key]}"))
-        else:
-            first[key] = view.name
-            kept.append(view)
-    return kept, copies
-
-
 def sort_out(
     board: FloatArray, views: Sequence[BoardView], config: CalibrationConfig
 ) -> tuple[Observations, Homographies, list[RejectedView]]:
@@ -61,9 +38,9 @@ def sort_out(
 
     These are copies, of another size, or have too few corners, corners on a line or in a wrong order.
     """
-    views, rejected = without_copies(views)
+    views, rejected = without_copies(views, config.turns)
     sizes = [(view.width, view.height) for view in views]
-    common = max(sorted(set(sizes)), key=sizes.count) if sizes else (0, 0)
+    common = max(sorted(set(sizes), reverse=True), key=sizes.count) if sizes else (0, 0)
     usable = []
     for view, size in zip(views, sizes, strict=True):
         if size != common:

@@ -49,6 +49,15 @@ class BoardView(Value):
             object.__setattr__(self, "covariances", covariances)
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class RejectedView:
+    """A view that is left out, and why."""
+
+    name: str
+    reason: str
+    detail: str = ""
+
+
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Observations(Value):
     """Views in flat columns: the corners of view v are rows `offsets[v]:offsets[v + 1]`.

@@ -16,7 +16,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.board_turns import BoardTurn, turn_of
-from calib.refine_reject import RejectedView
+from calib.refine_copies import SeenBefore
+from calib.refine_views import RejectedView
 from calib.rig_alone import AloneCamera, camera_alone, shape_of
 from calib.rig_estimate import RigEstimate
 from calib.rig_poses import CameraFrames, FirstPoses, first_poses
@@ -55,7 +56,7 @@ def calibrate_rig(
     names = tuple(one.name for one in cameras)
     if len(names) < 2 or len(set(names)) < len(names):
         raise ValueError(f"expected two or more cameras of different names, got {', '.join(names)}")
-    copied = _same_photos(cameras)
+    copied = _same_photos(cameras, turns)
     if copied is not None:
         return copied
     alone = []
@@ -103,13 +104,16 @@ def _typical_sigma(alone: Sequence[AloneCamera]) -> float:
     return float(np.median([one.sigma_px for one in alone]))
 
 
-def _same_photos(cameras: Sequence[RigCamera]) -> Rejected | None:
+def _same_photos(cameras: Sequence[RigCamera], turns: Sequence[BoardTurn]) -> Rejected | None:
+    """Nothing looks alike to within a fraction of a pixel from two places."""
     for i, one in enumerate(cameras):
-        seen = {view.points2D.tobytes(): view.name for view in one.views}
+        seen = SeenBefore(turns)
+        for view in one.views:
+            seen.add(view)
         for other in cameras[i + 1 :]:
             for view in other.views:
-                if view.points2D.tobytes() in seen:
-                    detail = f"{seen[view.points2D.tobytes()]} and {view.name} have the same corners to the last bit"
+                if same := seen.same(view):
+                    detail = f"{same[0].name} and {view.name} have the same corners, to {same[1]:.2f} px"
                     return Rejected("same_photos", f"{one.name} and {other.name}: {detail}")
     return None
 

@@ -1,8 +1,9 @@
 """How uncertain a calibrated rig is, and what it says of frames that it has not seen.
 
-With unit noise the covariance of what frames share is S⁻¹ (see `rig_system`), times the variance of the residuals. It
-takes residuals for independent; `by_frame` takes only the frames for independent, by leaving out each in turn with one
-Newton step, as `uncertainty` does with views.
+With unit noise the covariance of what frames share is Σ = S⁻¹ (see `rig_system`). Every corner speaks for itself, by
+its own residual, and what rejection has hidden is made up for, as in `uncertainty`; here the pose that is projected out
+is that of the frame, which the corners of several cameras share. It takes residuals for independent; `by_frame` takes
+only the frames for independent, by leaving out each in turn with one Newton step, as `uncertainty` does with views.
 
 The tangent of the pose of camera 2 relative to camera 1, T = T_2 T_1⁻¹, is  δ_2 − Ad(T) δ_1.  With T = (R, t) and
 δ = (ω, υ) its translation moves by ω × t + υ, and the baseline |t| by υ · t / |t|.
@@ -20,6 +21,7 @@ from jaxtyping import Float64
 from calib.rig_result import RigCalibration
 from calib.rig_system import RigSystem
 from calib.rig_views import RigObservations
+from calib.uncertainty_corners import corner_derivatives, corner_scores, jackknife, share_kept, whitened_lengths
 from sfm.core.arrays import FloatArray, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
@@ -70,12 +72,13 @@ class RelativeUncertainty(Value):
     sigma_translation: Float64[np.ndarray, " 3"]
 
 
-def rig_covariance(found: RigCalibration, *, by_frame: bool = False) -> RigCovariance | Rejected:
-    """Covariances at the solution.
+def rig_covariance(found: RigCalibration, *, by_frame: bool = False, alike: bool = False) -> RigCovariance | Rejected:
+    """Covariances at the solution, each corner as uncertain as its residual tells.
 
     Args:
         by_frame: by leaving out each frame in turn, which holds however residuals of one frame are correlated; it needs
             many more frames than shared parameters to be accurate itself.
+        alike: takes all corners of a camera for equally certain.
     Returns:
         `undetermined_parameters` where the frames leave a combination of them open.
     """
@@ -84,7 +87,11 @@ def rig_covariance(found: RigCalibration, *, by_frame: bool = False) -> RigCovar
     if unit is None:
         return Rejected("undetermined_parameters", "the frames leave a combination of parameters open")
     variance = found.sigma_px**2
-    shared = _jackknife(found, system) if by_frame else variance * unit
+    if by_frame:
+        parts = [_part_of(found, system, f) for f in range(len(found.observations.frames))]
+        shared = jackknife(np.stack([part for part, _ in parts]), np.stack([score for _, score in parts]))
+    else:
+        shared = variance * unit if alike else _by_corner(found, system, unit)
     if shared is None:
         return Rejected("undetermined_parameters", "without one of the frames a combination of parameters is open")
     mounts = np.zeros((len(found.names), 6, 6))
@@ -129,17 +136,35 @@ def relative_uncertainty(
     )
 
 
-def _jackknife(found: RigCalibration, system: RigSystem) -> FloatArray | None:
-    """(F − 1)/F Σ (θ₋f − mean)(…)ᵀ."""
-    parts = [_part_of(found, system, f) for f in range(len(found.observations.frames))]
-    S, steps = np.sum([part for part, _ in parts], axis=0), []
-    for part, score in parts:
-        inverse = _inverse(S - part)
-        if inverse is None:
-            return None
-        steps.append(inverse @ score)
-    apart = np.array(steps) - np.mean(steps, axis=0)
-    return (len(steps) - 1) / len(steps) * apart.T @ apart
+def _by_corner(found: RigCalibration, system: RigSystem, sigma: FloatArray) -> FloatArray:
+    """HC2, view by view; with what rejection has hidden."""
+    equations, meat = system.normal_equations(), np.zeros_like(sigma)
+    inverses, W = np.linalg.inv(equations.H), equations.W[:, :, :-1]
+    for c, o in enumerate(found.observations.cameras):
+        mount = found.cams_from_rig[c]
+        for v, f in enumerate(found.observations.frame_of[c].tolist()):
+            part = slice(o.offsets[v], o.offsets[v + 1])
+            rows = o.rows[part]
+            by = corner_derivatives(
+                found.cameras[c], found.columns[c], mount @ found.rigs_from_board[f], found.shape.points3D[rows],
+                found.shape.basis[rows], o.roots[part], found.residuals[c][part],
+            )  # fmt: skip
+            by_shared = np.zeros((len(rows), 2, len(sigma)))
+            held = slice(0, system.mount_slices[c].stop - system.mount_slices[c].start)
+            by_shared[:, :, system.mount_slices[c]] = by.by_pose[:, :, held]
+            by_shared[:, :, system.param_slices[c]] = by.by_params
+            by_shared[:, :, system.param_slices[-1].stop :] = by.by_shape
+            scores = corner_scores(by.by_pose @ mount.adjoint(), by_shared, by.residuals, inverses[f], W[f], sigma)
+            meat += scores.T @ scores
+    return sigma @ meat @ sigma / _share_kept(found) ** 2
+
+
+def _share_kept(found: RigCalibration) -> float:
+    """Over all cameras, whose corners are weighted by their own noise."""
+    if not any(found.rejected_corners):
+        return 1.0
+    cameras = found.observations.cameras
+    return share_kept(np.concatenate([whitened_lengths(o, r) for o, r in zip(cameras, found.residuals, strict=True)]))
 
 
 def _part_of(found: RigCalibration, system: RigSystem, frame: int) -> tuple[FloatArray, Vector]:
@@ -150,17 +175,6 @@ def _part_of(found: RigCalibration, system: RigSystem, frame: int) -> tuple[Floa
     H, W = alone.H[0], alone.W[0]
     reduced = alone.A - W.T @ np.linalg.solve(H, W)
     return reduced[:-1, :-1], reduced[:-1, -1]
-
-
-def _inverse(S: FloatArray) -> FloatArray | None:
-    """The inverse of a matrix of any scale, None where it is singular."""
-    root = np.sqrt(np.diag(S))
-    if not np.all(root > 0):
-        return None
-    values, vectors = np.linalg.eigh(S / np.outer(root, root))
-    if not values[0] > 1e-15 * values[-1]:
-        return None
-    return (vectors / values) @ vectors.T / np.outer(root, root)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

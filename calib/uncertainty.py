@@ -46,7 +46,15 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from calib.refine import Calibration, CalibrationConfig
+from calib.refine import Calibration
+from calib.uncertainty_corners import (
+    corner_derivatives,
+    corner_scores,
+    jackknife,
+    scaled_inverse,
+    share_kept,
+    whitened_lengths,
+)
 from sfm.core.arrays import FloatArray, Points2D, Value, Vector, readonly
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -54,11 +62,6 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3, skew
 
 _ALIGNMENTS = 8
-_LEAST_FREEDOM = 1e-3
-"""Of a residual's direction, below which the fit has followed all of it."""
-_LEAST_SHARE = 0.8
-_MEDIAN_LENGTH = 1.17741
-"""Of a pair of unit normal numbers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -103,12 +106,12 @@ def covariance(
         `undetermined_parameters` where the views leave a parameter open.
     """
     parts = _parts(calibration)
-    sigma = _inverse(parts.S)
+    sigma = scaled_inverse(parts.reduced.sum(0))
     if sigma is None:
         return Rejected("undetermined_parameters", "the views leave a combination of parameters open")
     variance = calibration.sigma_px**2
     if by_view:
-        shared = _jackknife(parts)
+        shared = jackknife(parts.reduced, parts.scores)
     else:
         shared = variance * sigma if alike else _by_corner(calibration, parts, sigma)
     if shared is None:
@@ -211,10 +214,6 @@ class _Parts:
     reduced: FloatArray
     scores: FloatArray
 
-    @property
-    def S(self) -> FloatArray:
-        return self.reduced.sum(0)
-
 
 def _parts(calibration: Calibration) -> _Parts:
     blocks = np.tril(calibration.system().blocks)
@@ -226,67 +225,24 @@ def _parts(calibration: Calibration) -> _Parts:
     return _Parts(H, W, reduced, scores)
 
 
-def _inverse(S: FloatArray) -> FloatArray | None:
-    """The inverse of a matrix of any scale, None where it is singular."""
-    root = np.sqrt(np.diag(S))
-    if not np.all(root > 0):
-        return None
-    values, vectors = np.linalg.eigh(S / np.outer(root, root))
-    if not values[0] > 1e-15 * values[-1]:
-        return None
-    return (vectors / values) @ vectors.T / np.outer(root, root)
-
-
 def _by_corner(calibration: Calibration, parts: _Parts, sigma: FloatArray) -> FloatArray:
     """HC2, view by view; with what rejection has hidden."""
-    observations, meat = calibration.observations, np.zeros_like(sigma)
+    observations, shape, meat = calibration.observations, calibration.shape, np.zeros_like(sigma)
     for v, inverse in enumerate(np.linalg.inv(parts.H)):
-        rows = slice(observations.offsets[v], observations.offsets[v + 1])
-        by_pose, by_shared, residuals = _whitened_derivatives(calibration, v, rows)
-        D = by_shared - by_pose @ (inverse @ parts.W[v])
-        leverages = by_pose @ inverse @ by_pose.swapaxes(1, 2) + D @ sigma @ D.swapaxes(1, 2)
-        values, vectors = np.linalg.eigh(np.eye(2) - leverages)
-        roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
-        scores = np.einsum("nik,nij,nj->nk", D, roots, residuals)
+        part = slice(observations.offsets[v], observations.offsets[v + 1])
+        rows = observations.rows[part]
+        by = corner_derivatives(
+            calibration.camera, calibration.columns, calibration.cams_from_board[v],
+            observations.board[rows] + shape.displacements[rows], shape.basis[rows],
+            observations.roots[part], calibration.residuals[part],
+        )  # fmt: skip
+        by_shared = np.concatenate([by.by_params, by.by_shape], axis=2)
+        scores = corner_scores(by.by_pose, by_shared, by.residuals, inverse, parts.W[v], sigma)
         meat += scores.T @ scores
     return sigma @ meat @ sigma / _share_kept(calibration) ** 2
 
 
-def _whitened_derivatives(calibration: Calibration, v: int, rows: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of the corners of a view: (n, 2, 6) by its pose, (n, 2, K) by what views share, and (n, 2) residuals."""
-    observations, shape = calibration.observations, calibration.shape
-    pose = calibration.cams_from_board[v]
-    at = observations.rows[rows]
-    points = pose @ (observations.board[at] + shape.displacements[at])
-    _, by_point, by_params, _ = calibration.camera.project_with_jacobians(points)
-    by_pose = np.concatenate([-by_point @ skew(points), by_point], axis=2)
-    by_shared = by_params[:, :, calibration.columns]
-    if len(shape.coefficients):
-        by_shared = np.concatenate([by_shared, by_point @ pose.rotation.matrix @ shape.basis[at]], axis=2)
-    a, b, c = observations.roots[rows].T
-    roots = np.stack([np.stack([a, b], -1), np.stack([np.zeros_like(c), c], -1)], -2)
-    residuals = np.einsum("nij,nj->ni", roots, np.nan_to_num(calibration.residuals[rows]))
-    return np.nan_to_num(roots @ by_pose), np.nan_to_num(roots @ by_shared), residuals
-
-
 def _share_kept(calibration: Calibration) -> float:
-    """1 − ½ c ρ, with ρ from the lengths between 0.8 c and c; 1 where none was rejected."""
     if not calibration.rejected_corners:
         return 1.0
-    a, b, c = calibration.observations.roots.T
-    u, v = np.nan_to_num(calibration.residuals).T
-    lengths = np.hypot(a * u + b * v, c * v)
-    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
-    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
-
-
-def _jackknife(parts: _Parts) -> FloatArray | None:
-    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ."""
-    S, steps = parts.S, []
-    for reduced, score in zip(parts.reduced, parts.scores, strict=True):
-        inverse = _inverse(S - reduced)
-        if inverse is None:
-            return None
-        steps.append(inverse @ score)
-    apart = np.array(steps) - np.mean(steps, axis=0)
-    return (len(steps) - 1) / len(steps) * apart.T @ apart
+    return share_kept(whitened_lengths(calibration.observations, calibration.residuals))

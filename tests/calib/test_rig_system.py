@@ -16,7 +16,7 @@ from calib.rig_views import RigObservations
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import Rotation3
-from tests.calib.boards_in_space import flat_board
+from tests.calib.boards_in_space import flat_board, with_corners
 from tests.calib.rigs_in_space import BESIDE, PAIR, THREE, photographed, poses_before_rig
 
 BOARD = flat_board(5, 4, 0.05)
@@ -45,7 +45,7 @@ def problem(rng, frames=3, **how):
     return RigSystem(observations, estimate, COLUMNS, free_shape=True, **how), observations, estimate
 
 
-def moved(estimate: RigEstimate, system: RigSystem, by_frame, by_shared) -> RigEstimate:
+def moved(estimate: RigEstimate, system: RigSystem, by_frame, by_shared, columns_of=COLUMNS) -> RigEstimate:
     """Another estimate, by the book: rigid motions on the left."""
 
     def turned(R, t, step):
@@ -59,7 +59,7 @@ def moved(estimate: RigEstimate, system: RigSystem, by_frame, by_shared) -> RigE
     frames = [turned(R, t, step) for R, t, step in zip(
         estimate.frame_rotations, estimate.frame_translations, by_frame, strict=True)]  # fmt: skip
     cameras = []
-    for camera, columns, at in zip(estimate.cameras, COLUMNS, system.param_slices, strict=True):
+    for camera, columns, at in zip(estimate.cameras, columns_of, system.param_slices, strict=True):
         params = camera.params.copy()
         params[columns] += by_shared[at]
         cameras.append(camera.with_params(params))
@@ -210,3 +210,85 @@ def test_frames_that_were_held_out_err_a_little_more(rng):
     assert not isinstance(held, Rejected)
     assert 1.0 < held.rms_px / held.training_rms_px < 1.15
     assert len(held.squares) == len(held.frames) == 16
+
+
+def test_deviations_hold_where_corners_are_unlike():
+    """Corners at the border of the board, which say most of a rig, err three times as much as the others."""
+    rng, board = np.random.default_rng(3), flat_board(8, 6, 0.03)
+    exact = photographed(*PAIR, board, poses_before_rig(10, rng), rng, 0.0, least=6)
+    noise = np.where((np.abs(board[:, :2]) >= np.abs(board[:, :2]).max(0)).any(axis=1), 0.15, 0.05)[:, None]
+    errors, by_corner, alike = [], [], []
+    for _ in range(60):
+        noisy = [dataclasses.replace(one, views=tuple(
+            with_corners(v, v.points2D + noise[v.corner_ids] * rng.normal(size=v.points2D.shape)) for v in one.views
+        ), camera=camera) for one, camera in zip(exact, PAIR[0], strict=True)]  # fmt: skip
+        found = calibrate_rig(board, noisy, RigConfig(reject=False, refine_known=True))
+        assert isinstance(found, RigCalibration)
+        apart = (found.cams_from_rig[1] @ BESIDE.inverse()).log()
+        params = [one.params - camera.params for one, camera in zip(found.cameras, PAIR[0], strict=True)]
+        errors.append(np.concatenate([apart, *params]))
+        for told, how in ((by_corner, False), (alike, True)):
+            known = rig_covariance(found, alike=how)
+            assert not isinstance(known, Rejected)
+            told.append(np.diag(known.shared))
+    true = np.mean(np.square(errors), axis=0)
+    # 60 trials know a deviation to 9 %, and several of them better.
+    assert np.mean(np.sqrt(np.mean(by_corner, axis=0) / true)) == pytest.approx(1.0, abs=0.12)
+    assert np.mean(np.sqrt(np.mean(alike, axis=0) / np.mean(by_corner, axis=0))) < 0.9
+
+
+def test_scores_of_corners_are_those_of_the_whole_jacobian(rng):
+    """Three cameras that do not all see every frame, two of a board's shape, and all in one dense matrix."""
+    seen = photographed(*THREE, BOARD, poses_before_rig(9, rng), rng, 0.1, least=8)
+    found = calibrate_rig(BOARD, seen, RigConfig(reject=False, shape="paraboloid", weigh_cameras=False))
+    assert isinstance(found, RigCalibration)
+    system, frames = found.system(), 6 * len(found.observations.frames)
+    J = dense_jacobian(found, system)
+    r = residuals_of(found.observations, found.estimate)
+    scale = np.sqrt(np.sum(J**2, axis=0))
+    inverse = np.linalg.inv(J.T @ J / np.outer(scale, scale)) / np.outer(scale, scale)
+    meat = np.zeros_like(inverse)
+    for n in range(len(r) // 2):
+        part = J[2 * n : 2 * n + 2]
+        values, vectors = np.linalg.eigh(np.eye(2) - part @ inverse @ part.T)
+        score = part.T @ (vectors / np.sqrt(values)) @ vectors.T @ r[2 * n : 2 * n + 2]
+        meat += np.outer(score, score)
+    expected = (inverse @ meat @ inverse)[frames:, frames:]
+    known = rig_covariance(found)
+    assert not isinstance(known, Rejected)
+    deviations = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(known.shared / np.outer(deviations, deviations), expected / np.outer(
+        deviations, deviations), atol=2e-3)  # fmt: skip
+
+
+def dense_jacobian(found: RigCalibration, system: RigSystem) -> np.ndarray:
+    """Central differences by frames, then by what they share."""
+    frames, columns = len(found.observations.frames), []
+    curvature = np.sqrt(np.diag(system.normal_equations().A))[:-1]
+    for k in range(6 * frames + system.shared_count):
+        size = 1e-6 if k < 6 * frames else 1e-3 / max(curvature[k - 6 * frames], 1e-3)
+        ends = []
+        for sign in (1, -1):
+            step = np.zeros(6 * frames + system.shared_count)
+            step[k] = sign * size
+            ends.append(residuals_of(found.observations, moved(
+                found.estimate, system, step[: 6 * frames].reshape(frames, 6), step[6 * frames :], found.columns
+            )))  # fmt: skip
+        columns.append((ends[0] - ends[1]) / (2 * size))
+    return np.stack(columns, 1)
+
+
+def test_what_rejection_of_a_rig_hides_is_made_up_for(rng):
+    """Heavy tails, cut off: what is left looks more certain than it is."""
+    exact = photographed(*PAIR, BOARD, poses_before_rig(10, rng), rng, 0.0, least=8)
+    noisy = [dataclasses.replace(one, views=tuple(
+        with_corners(v, v.points2D + 0.05 * rng.standard_t(2, v.points2D.shape)) for v in one.views
+    )) for one in exact]  # fmt: skip
+    found = calibrate_rig(BOARD, noisy)
+    assert isinstance(found, RigCalibration)
+    assert any(found.rejected_corners)
+    as_if_none = dataclasses.replace(found, rejected_corners=((), ()))
+    made_up, plain = rig_covariance(found), rig_covariance(as_if_none)
+    assert not isinstance(made_up, Rejected)
+    assert not isinstance(plain, Rejected)
+    assert 1.02 < np.sqrt(made_up.shared[0, 0] / plain.shared[0, 0]) <= 1.25

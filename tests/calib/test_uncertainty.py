@@ -223,7 +223,7 @@ def test_the_step_without_a_view_is_the_calibration_without_it(rng):
     from calib.uncertainty import _parts
 
     parts = _parts(found)
-    step = np.linalg.solve(parts.S - parts.reduced[3], parts.scores[3])
+    step = np.linalg.solve(parts.reduced.sum(0) - parts.reduced[3], parts.scores[3])
     actual = calibrated(views[:3] + views[4:]).camera.params - found.camera.params
     np.testing.assert_allclose(step, actual, rtol=0.1, atol=0.05 * np.sqrt(np.diag(covered(found).shared)).max() * 1e-2)
 

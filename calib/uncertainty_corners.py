@@ -1,0 +1,124 @@
+"""What the corners of photos say of the uncertainty of what photos share, each by its own residual; see `uncertainty`.
+
+A corner i has D_i (2, K), the derivatives by what is shared with those by the pose of its photo (or of its moment, in a
+rig) projected out,
+
+    D_i = J_i − P_i H⁻¹ W,      h_i = P_i H⁻¹ P_iᵀ + D_i Σ D_iᵀ
+
+with P_i (2, 6) by the pose, J_i (2, K) by what is shared, and H, W, Σ of the normal equations. The covariance is
+
+    Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ / share²,      r_i = (I − h_i)^−½ e_i
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from calib.refine_fit import CalibrationConfig
+from calib.refine_views import Observations
+from sfm.core.arrays import FloatArray, Points3D, Vector
+from sfm.core.cameras import Camera
+from sfm.core.geometry.rigid import Rigid3
+from sfm.core.geometry.rotation import skew
+
+_LEAST_FREEDOM = 1e-3
+"""Of a residual's direction, below which the fit has followed all of it."""
+_LEAST_SHARE = 0.8
+_MEDIAN_LENGTH = 1.17741
+"""Of a pair of unit normal numbers."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class CornerDerivatives:
+    """Of the n corners of a view, whitened: by the pose (n, 2, 6), the camera's free parameters (n, 2, k), the board's
+    coefficients (n, 2, B), and residuals (n, 2)."""
+
+    by_pose: FloatArray
+    by_params: FloatArray
+    by_shape: FloatArray
+    residuals: FloatArray
+
+
+def corner_derivatives(
+    camera: Camera, columns: np.ndarray, cam_from_board: Rigid3, points3D: Points3D, basis: FloatArray,
+    roots: FloatArray, residuals: FloatArray,
+) -> CornerDerivatives:  # fmt: skip
+    """Of one view; what is not seen counts nothing.
+
+    Args:
+        columns: positions of the free parameters.
+        points3D: (n, 3) of the corners, in the board's frame, as it is bent.
+        basis: (n, 3, B) by which the board's coefficients move them.
+        roots: (n, 3) of the corners' weights, and residuals (n, 2) in px; see `Observations`.
+    """
+    points = cam_from_board @ points3D
+    _, by_point, by_params, _ = camera.project_with_jacobians(points)
+    a, b, c = roots.T
+    whiten = np.stack([np.stack([a, b], -1), np.stack([np.zeros_like(c), c], -1)], -2)
+    by_pose = np.concatenate([-by_point @ skew(points), by_point], axis=2)
+    by_shape = by_point @ cam_from_board.rotation.matrix @ basis
+    return CornerDerivatives(
+        by_pose=np.nan_to_num(whiten @ by_pose),
+        by_params=np.nan_to_num(whiten @ by_params[:, :, columns]),
+        by_shape=np.nan_to_num(whiten @ by_shape),
+        residuals=np.einsum("nij,nj->ni", whiten, np.nan_to_num(residuals)),
+    )
+
+
+def corner_scores(
+    by_pose: FloatArray, by_shared: FloatArray, residuals: FloatArray, inverse: FloatArray, W: FloatArray,
+    sigma: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """(n, K) the rows (D_iᵀ r_i)ᵀ of corners with one pose.
+
+    Args:
+        by_pose: P (n, 2, 6); by_shared: J (n, 2, K); residuals: e (n, 2), all of them whitened.
+        inverse: H⁻¹ (6, 6) of the pose; W: (6, K); sigma: Σ (K, K), with unit noise.
+    """
+    D = by_shared - by_pose @ (inverse @ W)
+    leverages = by_pose @ inverse @ by_pose.swapaxes(1, 2) + D @ sigma @ D.swapaxes(1, 2)
+    values, vectors = np.linalg.eigh(np.eye(2) - leverages)
+    roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
+    return np.einsum("nik,nij,nj->nk", D, roots, residuals)
+
+
+def whitened_lengths(observations: Observations, residuals: FloatArray) -> Vector:
+    """(n,) of residuals in px; 0 of what is not seen."""
+    a, b, c = observations.roots.T
+    u, v = np.nan_to_num(residuals).T
+    return np.hypot(a * u + b * v, c * v)
+
+
+def share_kept(lengths: Vector) -> float:
+    """1 − ½ c ρ where corners were rejected, with ρ from the lengths between 0.8 c and c."""
+    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
+    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
+
+
+def scaled_inverse(S: FloatArray) -> FloatArray | None:
+    """The inverse of a matrix of any scale, None where it is singular."""
+    root = np.sqrt(np.diag(S))
+    if not np.all(root > 0):
+        return None
+    values, vectors = np.linalg.eigh(S / np.outer(root, root))
+    if not values[0] > 1e-15 * values[-1]:
+        return None
+    return (vectors / values) @ vectors.T / np.outer(root, root)
+
+
+def jackknife(reduced: FloatArray, scores: FloatArray) -> FloatArray | None:
+    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ, of views or moments that are left out in turn; None where one cannot be.
+
+    Args:
+        reduced: (V, K, K) what each adds to S, scores: (V, K) and to the gradient, with its pose eliminated.
+    """
+    S, steps = reduced.sum(0), []
+    for part, score in zip(reduced, scores, strict=True):
+        inverse = scaled_inverse(S - part)
+        if inverse is None:
+            return None
+        steps.append(inverse @ score)
+    apart = np.array(steps) - np.mean(steps, axis=0)
+    return (len(steps) - 1) / len(steps) * apart.T @ apart
