@@ -125,7 +125,7 @@ def covariance(
     known = system.information(held)
     sigma = system.inverse(motions)
     if isinstance(sigma, int):
-        return _undetermined(sigma, problem, layout)
+        return _undetermined(sigma, layout)
     points = np.zeros((len(problem.points3D), 3, 3))
     list(ordered_map(
         lambda part: kernels.point_covariances(
@@ -253,7 +253,7 @@ def _camera_blocks(layout: Layout, sigma: Marginals, cameras: int) -> FloatArray
     return blocks
 
 
-def _undetermined(entry: int, problem: BundleProblem, layout: Layout) -> Rejected:
+def _undetermined(entry: int, layout: Layout) -> Rejected:
     """Whose parameter an entry of the reduced system is."""
     row = entry // 6
     if row < len(layout.slot_frame):

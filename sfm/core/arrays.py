@@ -11,7 +11,7 @@ from types import EllipsisType, MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int32, Integer, UInt8
+from jaxtyping import Bool, Float64, Integer, UInt8
 from numpy.typing import DTypeLike
 
 Points2D: TypeAlias = Float64[np.ndarray, "N 2"]
@@ -23,7 +23,6 @@ Rays: TypeAlias = Float64[np.ndarray, "N 3"]
 Mask: TypeAlias = Bool[np.ndarray, " N"]
 """True keeps."""
 Indices: TypeAlias = Integer[np.ndarray, " M"]
-IndexPairs: TypeAlias = Int32[np.ndarray, "M 2"]
 Matrix3: TypeAlias = Float64[np.ndarray, "3 3"]
 Vector: TypeAlias = Float64[np.ndarray, " K"]
 if TYPE_CHECKING:
@@ -34,8 +33,6 @@ else:
 BoolArray: TypeAlias = Bool[np.ndarray, "..."]
 ImageU8: TypeAlias = UInt8[np.ndarray, "H W"] | UInt8[np.ndarray, "H W 3"]
 """An image at the edge of the program; colour is RGB."""
-ImageF32: TypeAlias = Float[np.ndarray, "H W"] | Float[np.ndarray, "H W 3"]
-"""An image inside the program, float32 in [0, 1]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

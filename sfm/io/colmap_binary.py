@@ -35,7 +35,6 @@ from sfm.io.colmap_tables import ImageTable, PointTable, colmap_model, pose_of
 _POINT_HEAD = np.dtype([("point_id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 _LENGTH_AT = _POINT_HEAD.itemsize - 8
 _TRACK_ITEM = np.dtype([("image_id", "<i4"), ("feature_id", "<i4")])
-_KEYPOINT_SIZE = 24
 _CAMERA_SENSOR = 0
 
 

@@ -5,8 +5,8 @@ that COLMAP and all that reads its databases can go on from ours. Tables with th
 has no place for: keys of finished work, the ledger of decisions, the files behind the images, and per pair the
 triangulation angle or the reason for its rejection.
 
-Keypoints are float32 on disk: what is read back is exactly `as_stored` of what was written, and a run that wants to
-resume bit for bit works with that from the start.
+Keypoints are float32 on disk. Stages work with what is read back, never with what was written: so a run that resumes
+comes to the same result, bit for bit.
 
 Threads: one thread writes (it alone may open transactions); any thread may read, and sees what the open transaction
 has written. Processes: many may read while one writes (write-ahead log); a second writer waits, then gives up with

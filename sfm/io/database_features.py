@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from sfm.core.arrays import FloatArray, Points2D
@@ -12,16 +10,11 @@ from sfm.io import _database_rows as rows_
 from sfm.io.sqlite_file import SqliteFile
 
 
-def as_stored(features: Features) -> Features:
-    """The features as they come back from the database: keypoints rounded to float32."""
-    return dataclasses.replace(features, points2D=features.points2D.astype(np.float32).astype(np.float64))
-
-
 class FeatureTables(SqliteFile):
     """The tables `keypoints` and `descriptors`."""
 
     def write_features(self, image_id: int, features: Features) -> None:
-        """Stores the features of an image in place of earlier ones; `as_stored` is what will be read back."""
+        """Stores the features of an image in place of earlier ones; keypoints are rounded to float32."""
         keypoints = np.column_stack([features.points2D, features.scales, features.orientations]).astype("<f4")
         rows, width = features.descriptors.shape
         with self.transaction():

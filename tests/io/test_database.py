@@ -20,7 +20,6 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import DescriptorKind, Features, Matches, PairKind, TwoViewGeometry
 from sfm.io.bookkeeping import Decision, ImageSource
 from sfm.io.database import Database
-from sfm.io.database_features import as_stored
 from sfm.io.database_images import ImageRow
 from sfm.io.database_pairs import pair_id, pair_of
 
@@ -34,6 +33,11 @@ def random_features(count: int, rng: np.random.Generator, width: int = 128) -> F
         rng.uniform(-3, 3, count).astype(np.float32),
         rng.integers(0, 256, (count, width), np.uint8),
     )
+
+
+def as_stored(features: Features) -> Features:
+    """The features as they come back from the database: keypoints rounded to float32."""
+    return dataclasses.replace(features, points2D=features.points2D.astype(np.float32).astype(np.float64))
 
 
 def calibrated(rng: np.random.Generator, matches: int = 6) -> TwoViewGeometry:

@@ -26,11 +26,10 @@ from sfm.core.optim import _sparse_cholesky_kernels as kernels
 from sfm.core.optim._cholesky_kernels import PANEL, factor_panel
 from sfm.core.optim.block_pattern import BLOCK, BlockPattern
 from sfm.core.optim.dense_cholesky import SHARE_FROM, STRIP, eliminate_panel, strip_count
+from sfm.core.optim.front_schedule import schedule_of
 from sfm.core.optim.ordering import Fronts, find_fronts
 from sfm.core.optim.selected_inverse import front_inverse, gathered_blocks, least_pivot_of
 
-_JOBS = 8
-"""Subtrees of about this part of the work; more would leave more fronts above them, which are done one by one."""
 _WORTH_SHARING_S = 5e-3
 """Seconds of a whole factorisation from which threads pay."""
 
@@ -83,7 +82,7 @@ class SparseCholesky:
 
     def __init__(self, pattern: BlockPattern, held: BoolArray, fronts: Fronts | None = None) -> None:
         fronts = find_fronts(pattern, held) if fronts is None else fronts
-        schedule = _schedule(fronts)
+        schedule = schedule_of(fronts)
         self._free, self._blocks = _free_in_order(fronts, held), len(pattern.columns)
         self._plan = _plan(pattern, held, fronts, schedule.rest_at)
         self._jobs, self._top = schedule.jobs, schedule.top
@@ -164,82 +163,7 @@ def _own_blocks(plan: Plan, own: slice, Z: FloatArray) -> FloatArray:
 
 def sparse_bytes(fronts: Fronts) -> int:
     """Memory that `SparseCholesky` takes for the numbers of these fronts."""
-    return 8 * int(fronts.factor_sizes.sum() + _schedule(fronts).size)
-
-
-class _Schedule(NamedTuple):
-    """Subtrees that may be factored at the same time, the fronts above them, and where triangles lie in U.
-
-    Attributes:
-        jobs: the fronts of one subtree or several, children before their parents.
-        top: the fronts above all of these.
-        rest_at: (F,) where the triangle of each front begins.
-        size: numbers in U.
-    """
-
-    jobs: list[np.ndarray]
-    top: np.ndarray
-    rest_at: np.ndarray
-    size: int
-
-
-def _schedule(fronts: Fronts) -> _Schedule:
-    """Cuts the tree where the subtrees become small; what they leave over waits for the fronts above."""
-    parent, seconds = fronts.parent, fronts.seconds
-    work, first = seconds.copy(), np.arange(len(parent))
-    for f, up in enumerate(parent.tolist()):
-        if up >= 0:
-            work[up] += work[f]
-            first[up] = min(first[up], first[f])
-    share = seconds.sum() / _JOBS
-    is_top = work > share
-    roots = np.flatnonzero(~is_top & ((parent < 0) | is_top[parent]))
-    jobs: list[list[int]] = []
-    room = 0.0
-    for root in roots.tolist():
-        if not jobs or work[root] > room:
-            jobs.append([])
-            room = share
-        jobs[-1].extend(range(first[root], root + 1))
-        room -= work[root]
-    stacks, waiting = _Stacks(fronts, roots), int(fronts.rest_sizes[roots].sum())
-    size = waiting
-    for job in jobs:
-        size = stacks.place(job, size)
-    # The stacks of the jobs are empty when the fronts above begin with theirs.
-    top = np.flatnonzero(is_top)
-    size = max(size, stacks.place(top.tolist(), waiting))
-    return _Schedule([np.array(job, np.int64) for job in jobs], top, stacks.rest_at, size)
-
-
-class _Stacks:
-    """Where triangles lie in U: first those of the `roots` of subtrees, which wait; then two stacks for each job."""
-
-    def __init__(self, fronts: Fronts, roots: np.ndarray) -> None:
-        parent, sizes = fronts.parent, fronts.rest_sizes
-        self.rest_at = np.zeros(len(parent), np.int64)
-        self.rest_at[roots] = np.cumsum(sizes[roots]) - sizes[roots]
-        self._depth = np.zeros(len(parent), np.int64)
-        for f in np.flatnonzero(parent >= 0)[::-1]:
-            self._depth[f] = self._depth[parent[f]] + 1
-        self._own = sizes.copy()
-        self._own[roots] = 0
-        self._of_children = np.zeros(len(parent), np.int64)
-        np.add.at(self._of_children, parent[parent >= 0], self._own[parent >= 0])
-
-    def place(self, job: list[int], begin: int) -> int:
-        """Places the triangles of a job's fronts from `begin` on, and returns where they end."""
-        heights, peaks, offsets = [0, 0], [0, 0], []
-        for f in job:
-            side = int(self._depth[f] % 2)
-            offsets.append(heights[side])
-            heights[side] += int(self._own[f])
-            peaks[side] = max(peaks[side], heights[side])
-            heights[1 - side] -= int(self._of_children[f])
-        for f, offset in zip(job, offsets, strict=True):
-            if self._own[f]:
-                self.rest_at[f] = begin + offset + (peaks[0] if self._depth[f] % 2 else 0)
-        return begin + sum(peaks)
+    return 8 * int(fronts.factor_sizes.sum() + schedule_of(fronts).size)
 
 
 def _free_in_order(fronts: Fronts, held: BoolArray) -> np.ndarray:
