@@ -21,7 +21,7 @@ from jaxtyping import Float64
 from calib.rig_result import RigCalibration
 from calib.rig_system import RigSystem
 from calib.rig_views import RigObservations
-from calib.uncertainty_corners import corner_derivatives, corner_scores, jackknife, share_kept, whitened_lengths
+from calib.uncertainty_corners import corner_derivatives, corner_scores, jackknife
 from sfm.core.arrays import FloatArray, Value, Vector, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
@@ -156,15 +156,7 @@ def _by_corner(found: RigCalibration, system: RigSystem, sigma: FloatArray) -> F
             by_shared[:, :, system.param_slices[-1].stop :] = by.by_shape
             scores = corner_scores(by.by_pose @ mount.adjoint(), by_shared, by.residuals, inverses[f], W[f], sigma)
             meat += scores.T @ scores
-    return sigma @ meat @ sigma / _share_kept(found) ** 2
-
-
-def _share_kept(found: RigCalibration) -> float:
-    """Over all cameras, whose corners are weighted by their own noise."""
-    if not any(found.rejected_corners):
-        return 1.0
-    cameras = found.observations.cameras
-    return share_kept(np.concatenate([whitened_lengths(o, r) for o, r in zip(cameras, found.residuals, strict=True)]))
+    return sigma @ meat @ sigma
 
 
 def _part_of(found: RigCalibration, system: RigSystem, frame: int) -> tuple[FloatArray, Vector]:

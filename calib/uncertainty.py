@@ -11,9 +11,8 @@ and h_i its leverage, the part of its own error that the fit has followed,
 
     Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ,      r_i = (I − h_i)^−½ e_i
 
-which is right on average where corners are alike as well. Rejection of corners beyond a length c makes e_i small and
-the others' say too great: a residual near c is lost or kept by little. With ρ the density of lengths there, all is
-divided by (1 − ½ c ρ)².
+which is right on average where corners are alike as well. What rejection hides is not added: its limits are far beyond
+what good corners err by.
 
 Both take residuals for independent. `by_view` takes only the views for independent: each is left out in turn, by one
 Newton step from the solution,
@@ -52,8 +51,6 @@ from calib.uncertainty_corners import (
     corner_scores,
     jackknife,
     scaled_inverse,
-    share_kept,
-    whitened_lengths,
 )
 from sfm.core.arrays import FloatArray, Points2D, Value, Vector, readonly
 from sfm.core.cameras import Camera
@@ -226,7 +223,7 @@ def _parts(calibration: Calibration) -> _Parts:
 
 
 def _by_corner(calibration: Calibration, parts: _Parts, sigma: FloatArray) -> FloatArray:
-    """HC2, view by view; with what rejection has hidden."""
+    """HC2, view by view."""
     observations, shape, meat = calibration.observations, calibration.shape, np.zeros_like(sigma)
     for v, inverse in enumerate(np.linalg.inv(parts.H)):
         part = slice(observations.offsets[v], observations.offsets[v + 1])
@@ -239,10 +236,4 @@ def _by_corner(calibration: Calibration, parts: _Parts, sigma: FloatArray) -> Fl
         by_shared = np.concatenate([by.by_params, by.by_shape], axis=2)
         scores = corner_scores(by.by_pose, by_shared, by.residuals, inverse, parts.W[v], sigma)
         meat += scores.T @ scores
-    return sigma @ meat @ sigma / _share_kept(calibration) ** 2
-
-
-def _share_kept(calibration: Calibration) -> float:
-    if not calibration.rejected_corners:
-        return 1.0
-    return share_kept(whitened_lengths(calibration.observations, calibration.residuals))
+    return sigma @ meat @ sigma

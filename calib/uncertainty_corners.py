@@ -7,7 +7,7 @@ rig) projected out,
 
 with P_i (2, 6) by the pose, J_i (2, K) by what is shared, and H, W, Σ of the normal equations. The covariance is
 
-    Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ / share²,      r_i = (I − h_i)^−½ e_i
+    Σ (Σ_i D_iᵀ r_i r_iᵀ D_i) Σ,      r_i = (I − h_i)^−½ e_i
 """
 
 from __future__ import annotations
@@ -16,18 +16,13 @@ import dataclasses
 
 import numpy as np
 
-from calib.refine_fit import CalibrationConfig
-from calib.refine_views import Observations
-from sfm.core.arrays import FloatArray, Points3D, Vector
+from sfm.core.arrays import FloatArray, Points3D
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import skew
 
 _LEAST_FREEDOM = 1e-3
 """Of a residual's direction, below which the fit has followed all of it."""
-_LEAST_SHARE = 0.8
-_MEDIAN_LENGTH = 1.17741
-"""Of a pair of unit normal numbers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -82,19 +77,6 @@ def corner_scores(
     values, vectors = np.linalg.eigh(np.eye(2) - leverages)
     roots = vectors / np.sqrt(np.maximum(values, _LEAST_FREEDOM))[:, None] @ vectors.swapaxes(1, 2)
     return np.einsum("nik,nij,nj->nk", D, roots, residuals)
-
-
-def whitened_lengths(observations: Observations, residuals: FloatArray) -> Vector:
-    """(n,) of residuals in px; 0 of what is not seen."""
-    a, b, c = observations.roots.T
-    u, v = np.nan_to_num(residuals).T
-    return np.hypot(a * u + b * v, c * v)
-
-
-def share_kept(lengths: Vector) -> float:
-    """1 − ½ c ρ where corners were rejected, with ρ from the lengths between 0.8 c and c."""
-    limit = CalibrationConfig().keep_within_sigma * float(np.median(lengths)) / _MEDIAN_LENGTH
-    return max(1 - float(np.mean(lengths > 0.8 * limit)) / 0.4, _LEAST_SHARE)
 
 
 def scaled_inverse(S: FloatArray) -> FloatArray | None:
