@@ -1,17 +1,20 @@
 from __future__ import annotations
 
+import ast
 import errno
 import io
 import json
 import os
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+import calib
 from calib.boards import charuco
 from calib.cli import main
-from calib.cli.photos import detect_photos, detection_from_json, detection_json, find_photos
+from calib.cli.photos import detect_photos, detection_from_json, detection_json, detector_sources, find_photos
 from calib.detect import Detection
 from sfm.core.errors import ExitCode, InputError, Rejected
 
@@ -63,6 +66,30 @@ def test_the_cache_knows_content_and_not_names(photos, tmp_path):
     np.testing.assert_array_equal(first.points2D, second.points2D)
     detect_photos({"renamed.png": copy}, charuco(6, 5, 0.031, 0.022), cache=cache)
     assert len(list(cache.iterdir())) == 4
+
+
+def test_another_version_looks_anew(photos, tmp_path, monkeypatch):
+    one = {"a2.png": photos["a2.png"]}
+    detect_photos(one, BOARD, cache=tmp_path / "cache")
+    monkeypatch.setattr(calib, "__version__", "99.0")
+    detect_photos(one, BOARD, cache=tmp_path / "cache")
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+def test_the_cache_depends_on_every_source_that_looks_at_a_photo():
+    root, met, left = Path(calib.__file__).parents[1], set(), {"calib.detect", "sfm.io.images"}
+    while left:
+        name = left.pop()
+        file = (root / name.replace(".", "/")).with_suffix(".py")
+        if file in met or not file.is_file():
+            continue
+        met.add(file)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                left |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    only_types_and_errors = {root / "sfm" / name for name in ("core/arrays.py", "core/errors.py", "io/atomic.py")}
+    assert len(met) > 10
+    assert met - only_types_and_errors <= set(detector_sources())
 
 
 def test_a_broken_cache_is_made_anew(photos, tmp_path):
