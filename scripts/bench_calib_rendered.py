@@ -120,8 +120,8 @@ def calibrated(case: Case, views: list[BoardView], errors: list[np.ndarray], wan
     if isinstance(found, Rejected):
         return {**out, "failed": f"{found.reason} {found.detail}"}
     count = len(case.camera.params)
-    sigmas = [given and list(given.deviations.values())[:count] for given in (
-        covariance(found), covariance(found, by_view=True))]  # fmt: skip
+    given = covariance(found), covariance(found, by_view=True)
+    sigmas = [None if isinstance(one, Rejected) else list(one.deviations.values())[:count] for one in given]
     return {
         **out, "error": (found.camera.params - case.camera.params).tolist(), "sigma": sigmas[0] or None,
         "sigma_by_view": sigmas[1] or None, "parts": parts_of_views(found, views, errors)[:, :count].tolist(),
@@ -274,15 +274,16 @@ def rendered(
     part = np.s_[low[1] * PARTS : high[1] * PARTS, low[0] * PARTS : high[0] * PARTS]
     directions, inverse = rays.rays[part] @ pose.rotation.matrix, pose.inverse()
     center = inverse.translation
-    level = np.zeros(directions.shape[:2])
-    for _ in range(3 if case.bend else 1):
-        depth = (level - center[2]) / directions[..., 2]
-        hits = center[:2] + depth[..., None] * directions[..., :2]
-        level = height(case, hits[..., 0])
+    depth = -center[2] / directions[..., 2]
+    for _ in range(2 if case.bend else 0):
+        across = center[0] + depth * directions[..., 0]
+        depth = (height(case, across) - center[2]) / directions[..., 2]
+    hits = center[:2] + depth[..., None] * directions[..., :2]
     place = (hits + drawn.corners[0]) * TEXELS_PER_M - 0.5
     place[~(rays.seen[part] & (depth > 0) & np.isfinite(depth))] = -1e6
+    columns, rows = cv2.split(np.clip(place, -1e6, 1e6).astype(np.float32))
     fine = cv2.remap(
-        paint, np.clip(place, -1e6, 1e6).astype(np.float32), None, cv2.INTER_LINEAR,
+        paint, columns, rows, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT, borderValue=SURROUND,
     )  # fmt: skip
     fine = cv2.GaussianBlur(fine, (0, 0), blur_px * PARTS)
