@@ -40,6 +40,7 @@ from calib.uncertainty_holdout import (
     views_of,
 )
 from calib.uncertainty_shapes import RankedShape, choose_shape
+from calib.yardstick import Yardstick, measure_lens
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, Observer, StageFinished, StageStarted
@@ -117,6 +118,7 @@ class CalibratedCamera(Value):
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
         would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
+        yardstick: the lens beside a splined one; None where it was given rather than chosen.
     """
 
     found: Calibration
@@ -131,6 +133,7 @@ class CalibratedCamera(Value):
     findings: tuple[Finding, ...]
     flat_px: float = math.nan
     would_bring: tuple[str, ...] = ()
+    yardstick: Yardstick | Rejected | None = None
 
     @property
     def doubts(self) -> CalibrationCovariance | Rejected:
@@ -248,8 +251,7 @@ def calibrate_camera(
         held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     halves = split_half(seen.points3D, found, config, rng=np.random.default_rng(plan.seed))
     plain, by_view = covariance(found), covariance(found, by_view=True)
-    observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
-    return CalibratedCamera(
+    made = CalibratedCamera(
         found=found,
         config=config,
         lenses=lenses,
@@ -265,6 +267,17 @@ def calibrate_camera(
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
+    made = with_yardstick(made, seen.points3D, plan) if plan.lens == AUTO else made
+    observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
+    return made
+
+
+def with_yardstick(made: CalibratedCamera, board: Points3D, plan: CameraPlan = CameraPlan()) -> CalibratedCamera:
+    """The same, with its lens beside a splined one."""
+    held_out_px = math.inf if isinstance(made.held_out, Rejected) else made.held_out.rms_px
+    rng = np.random.default_rng(plan.seed)
+    measured = measure_lens(board, made.found, made.config, held_out_px, folds=plan.folds, rng=rng)
+    return dataclasses.replace(made, yardstick=measured)
 
 
 def _held_out_flat(
