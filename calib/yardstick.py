@@ -5,11 +5,11 @@ corners of views that were held out. If it predicts no better, no lens model wil
 calibrated camera says by how many pixels, and where in the image, as far as these photos can tell.
 
 That holds only while the board does not pass for the lens. With boards, poses and noise of real sets, the lens exactly
-right and a board whose corners lie up to 0.2 mm beside the best paraboloid, the splined lens lowers held-out errors by
-1 to 6 %, by two to three standard errors, and leads away from the truth. With every corner of the board free it then
-changes them by −1.2 to +1.6 %, while lenses that are off by 0.1 px (rms) are found out by −5 to −8 %. So the comparison
-is made with a free board, unless that predicts worse than the board as it was calibrated: then there is nothing in it
-to be taken for the lens.
+right and a board whose corners lie 0.1 mm beside the best paraboloid, the splined lens lowers held-out errors by 1 to
+6 %, by up to three standard errors, and leads away from the truth. With every corner of the board free it raises them
+by 0.2 to 2 % in all trials; where the lens is off by 0.1 px (rms) it lowers them by 2 to 18 %. So the comparison is
+made with a free board, unless that predicts worse than the board as it was calibrated: then there is nothing in it to
+be taken for the lens.
 
 Reference:
     Kogan, mrcal, A tour of mrcal (documentation): a splined lens beside a lean one, and the difference between them.
@@ -94,7 +94,8 @@ class Yardstick(Value):
         if not self.is_lens:
             return f"no error of the lens shows: {errors}; what they differ by, {apart}, these photos cannot tell"
         worst = f"{self.worst_px:.2g} px near ({self.worst_at[0]:.0f}, {self.worst_at[1]:.0f})"
-        return f"{errors}: {self.lens} is off by about {apart}, {worst}; a richer lens would help"
+        shape = ", with --shape free," if self.shape == "free" else ""
+        return f"{errors}: {self.lens} is off by about {apart}, {worst}; a richer --model{shape} would help"
 
     @property
     def of_board(self) -> str:

@@ -36,7 +36,7 @@ from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.optim.levenberg_marquardt import Trial
 
 _LOOSE = 8.0
-"""κ: half of it halves what is followed of lenses that are off by 0.1 to 0.3 px, twice of it adds to errors held out."""
+"""κ: half of it halves what is followed of lenses that are off by 0.1 to 0.3 px, twice of it costs more."""
 _FAR = 3.0
 """Root of the weight of bends over that of displacements themselves."""
 _BEYOND = 0.05

@@ -20,7 +20,7 @@ from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
-from calib.cli.tried import with_what_was_tried
+from calib.cli.tried import with_what_was_measured, with_what_was_tried
 from calib.detect import Detection
 from calib.diagnose import Finding, diagnose
 from calib.diagnose_window import window_finding
@@ -273,11 +273,15 @@ def calibrate_camera(
 
 
 def with_yardstick(made: CalibratedCamera, board: Points3D, plan: CameraPlan = CameraPlan()) -> CalibratedCamera:
-    """The same, with its lens beside a splined one."""
+    """The same, with its lens beside a splined one, and what follows for the findings."""
     held_out_px = math.inf if isinstance(made.held_out, Rejected) else made.held_out.rms_px
     rng = np.random.default_rng(plan.seed)
     measured = measure_lens(board, made.found, made.config, held_out_px, folds=plan.folds, rng=rng)
-    return dataclasses.replace(made, yardstick=measured)
+    if isinstance(measured, Rejected):
+        return dataclasses.replace(made, yardstick=measured)
+    return dataclasses.replace(
+        made, yardstick=measured, findings=with_what_was_measured(made.findings, measured)
+    )  # fmt: skip
 
 
 def _held_out_flat(
