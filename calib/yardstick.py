@@ -5,9 +5,9 @@ corners of views that were held out. If it predicts no better, no lens model wil
 calibrated camera says by how many pixels, and where in the image, as far as these photos can tell.
 
 That holds only while the board does not pass for the lens. With boards, poses and noise of real sets, the lens exactly
-right and a board whose corners lie 0.1 mm beside the best paraboloid, the splined lens lowers held-out errors by 1 to
-6 %, by up to three standard errors, and leads away from the truth. With every corner of the board free it raises them
-by 0.2 to 2 % in all trials; where the lens is off by 0.1 px (rms) it lowers them by 2 to 18 %. So the comparison is
+right and a board whose corners lie 0.1 mm beside the best paraboloid, the splined lens lowers held-out errors by up to
+4 %, by up to three standard errors, and leads away from the truth. With every corner of the board free it raises them
+by 0.2 to 3 % in all trials; where the lens is off by 0.1 px (rms) it lowers them by 2 to 18 %. So the comparison is
 made with a free board, unless that predicts worse than the board as it was calibrated: then there is nothing in it to
 be taken for the lens.
 
@@ -92,7 +92,8 @@ class Yardstick(Value):
         errors = f"held-out {self.lens_rms_px:.4f} px with {self.lens}, {self.splined_rms_px:.4f} px splined"
         apart = f"{self.differs_px:.2g} px (rms where corners were)"
         if not self.is_lens:
-            return f"no error of the lens shows: {errors}; what they differ by, {apart}, these photos cannot tell"
+            told = f"the two differ by {apart}, and these photos cannot tell which is right"
+            return f"no error of the lens shows: {errors}; {told}"
         worst = f"{self.worst_px:.2g} px near ({self.worst_at[0]:.0f}, {self.worst_at[1]:.0f})"
         shape = ", with --shape free," if self.shape == "free" else ""
         return f"{errors}: {self.lens} is off by about {apart}, {worst}; a richer --model{shape} would help"
