@@ -40,6 +40,8 @@ from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 _RULES = StopRules(max_iterations=40, relative_cost_tolerance=1e-6, gradient_tolerance=0.0)
 _CLEAR = 2.0
 """Standard errors by which the splined lens has to be better."""
+_NOTABLE = 0.98
+"""Of the held-out error, below which it stays open whether it is the lens though it may be chance."""
 _ACROSS = 24
 """Cells of the image's width in which the two are compared."""
 _ALIGNMENTS = 8
@@ -93,7 +95,8 @@ class Yardstick(Value):
         apart = f"{self.differs_px:.2g} px (rms where corners were)"
         if not self.is_lens:
             told = f"the two differ by {apart}, and these photos cannot tell which is right"
-            return f"no error of the lens shows: {errors}; {told}"
+            is_better = self.splined_rms_px < _NOTABLE * self.lens_rms_px
+            return f"{'open' if is_better else 'no error of the lens shows'}: {errors}; {told}"
         worst = f"{self.worst_px:.2g} px near ({self.worst_at[0]:.0f}, {self.worst_at[1]:.0f})"
         shape = ", with --shape free," if self.shape == "free" else ""
         return f"{errors}: {self.lens} is off by about {apart}, {worst}; a richer --model{shape} would help"
@@ -118,12 +121,12 @@ def measure_lens(
         config: that it was made with.
         held_out_px: its error on views that were held out, where it is known.
     Returns:
-        what the calibrations without some of the views were refused for, or `not_seen` where one of these has corners
-        beyond what such a camera sees.
+        what the calibrations without some of the views were refused for, `not_seen` where one of these has corners
+        beyond what such a camera sees, `no_residuals` where corners have no errors.
     """
     views, order = views_of(found.observations), rng.permutation(len(found.observations))
     compared: tuple[Calibration, Vector, Vector] | Rejected = Rejected("too_large", "of this many corners")
-    for shape in ("free", config.shape):
+    for shape in dict.fromkeys(("free", config.shape)):
         if shape == "free" and free_is_too_large(len(board), len(found.residuals)):
             continue
         compared = _compared(board, views, dataclasses.replace(config, shape=shape, reject=False), order, folds)
@@ -134,6 +137,8 @@ def measure_lens(
     base, errors, splined_errors = compared
     splined, _ = _splined(base)
     differences, pixels = _differences(base, splined)
+    if not (np.all(np.isfinite(splined_errors)) and np.isfinite(differences).any()):
+        return Rejected("not_seen", "the splined lens does not see all corners")
     worst = pixels[int(np.nanargmax(differences))]
     return Yardstick(
         lens=found.lens,
@@ -169,6 +174,8 @@ def _compared(
         fit = calibrate(board, [views[v] for v in kept], config)
         if isinstance(fit, Rejected):
             return fit
+        if not fit.sigma_px > 0:
+            return Rejected("no_residuals", "corners are fitted exactly")
         turns = config.turns if fit.shape.kind != "flat" else ()
         observations, errors[held] = read_as_suits(fit.camera, fit.shape, base.observations.of_views(held), turns)
         system, seen = fit_poses(fit.camera, fit.shape, observations)

@@ -183,3 +183,18 @@ def test_views_too_few_to_hold_any_out_are_told():
     result = measure_lens(BOARD, found, CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, Rejected)
     assert result.reason == "too_few_views"
+
+
+def test_corners_without_errors_accuse_no_lens():
+    rng = np.random.default_rng(0)
+    views = seen(LENS, BOARD, poses_before(LENS, 8, rng), rng, 0.0)
+    found = calibrate(BOARD, views, CONFIG)
+    assert isinstance(found, Calibration)
+    result = measure_lens(BOARD, found, CONFIG, folds=2, rng=np.random.default_rng(0))
+    assert isinstance(result, Rejected) or result.differs_px < 1e-6
+
+
+def test_what_is_better_by_chance_only_stays_open(wavy):
+    words = [dataclasses.replace(wavy, is_lens=False, splined_rms_px=f * wavy.lens_rms_px).of_lens for f in (0.9, 1.0)]
+    assert words[0].startswith("open: ")
+    assert words[1].startswith("no error of the lens shows: ")
