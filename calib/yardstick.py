@@ -25,7 +25,8 @@ from jaxtyping import Float64
 
 from calib.diagnose import coverage
 from calib.refine import Calibration, CalibrationConfig, calibrate
-from calib.refine_board import BoardShape, ShapeKind
+from calib.refine_board import BoardShape, ShapeKind, board_shape
+from calib.refine_system import CalibrationSystem
 from calib.refine_views import BoardView
 from calib.uncertainty import pixel_grid, projection_difference
 from calib.uncertainty_choice import is_clearly_lower
@@ -38,6 +39,9 @@ from sfm.core.geometry.rotation import Rotation3, skew
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
 
 _RULES = StopRules(max_iterations=40, relative_cost_tolerance=1e-6, gradient_tolerance=0.0)
+_TO_THE_END = StopRules(max_iterations=100, relative_cost_tolerance=1e-8, gradient_tolerance=0.0)
+_NEAR = 1e-6
+"""Damping near the minimum over the usual one."""
 _CLEAR = 2.0
 """Standard errors by which the splined lens has to be better."""
 _NOTABLE = 0.98
@@ -171,9 +175,9 @@ def _compared(
     for fold in range(folds):
         held = sorted(order[fold::folds].tolist())
         kept = sorted(set(range(len(views))) - set(held))
-        fit = calibrate(board, [views[v] for v in kept], config)
-        if isinstance(fit, Rejected):
-            return fit
+        if len(kept) < config.min_views:
+            return Rejected("too_few_views", f"{len(kept)} of {config.min_views} needed")
+        fit = _of_views(base, kept)
         if not fit.sigma_px > 0:
             return Rejected("no_residuals", "corners are fitted exactly")
         turns = config.turns if fit.shape.kind != "flat" else ()
@@ -190,6 +194,33 @@ def _compared(
         sums = np.bincount(observations.view_of, np.where(np.isfinite(lengths), lengths, np.inf), len(held))
         splined_errors[held] = sums / np.diff(observations.offsets)
     return base, errors, splined_errors
+
+
+def _of_views(base: Calibration, kept: list[int]) -> Calibration:
+    """The calibration from these views only; it starts from that of all, which saves half of the time."""
+    observations, start = base.observations.of_views(kept), base.estimate.of_views(kept)
+    if base.shape.kind == "free":
+        # Points that fewer than two of these views show do not move.
+        shown = np.bincount(observations.rows, minlength=len(observations.board)) >= 2
+        shape = board_shape("free", observations.board, shown)
+        moved = np.einsum("pcs,pc->s", shape.basis, base.shape.displacements)
+        start = dataclasses.replace(start, shape=dataclasses.replace(shape, coefficients=moved))
+    system = CalibrationSystem(
+        observations, start, base.columns, free_shape=len(start.shape.coefficients) > 0,
+        keep_invertible=base.keep_invertible, caution=_NEAR, by_secant=True,
+    )  # fmt: skip
+    cost = minimize(system, _TO_THE_END).final_cost
+    estimate = system.estimate
+    freedom = 2 * len(observations.rows) - 6 * len(kept) - system.shared_count
+    return dataclasses.replace(
+        base,
+        camera=estimate.camera,
+        cams_from_board=estimate.cams_from_board,
+        shape=estimate.shape,
+        observations=observations,
+        residuals=system.residuals(),
+        sigma_px=math.sqrt(2 * cost / freedom) if freedom > 0 else math.nan,
+    )
 
 
 def _splined(fit: Calibration) -> tuple[SplinedLens, BoardShape]:
