@@ -44,6 +44,10 @@ class DetectConfig:
     """A corner's standard deviation in its worst direction by the distance to its neighbours: above, its fit went
     astray, as when both edges become one."""
 
+    max_turn_deg: float = 25.0
+    """An edge of a crossing that is turned by more from where the neighbours of the corner lie is none of the board's:
+    at the outer corners of the outer squares a fit finds two edges of its own. Photos of boards stay below 8."""
+
     max_bend: float = 6.0
     """Most deviation from where the neighbours want a corner, by the median deviation of the board's corners."""
 
@@ -105,9 +109,17 @@ def fitted_crossings(
     corners.reject(jumped, "jumped")
     worst = np.sqrt(np.linalg.norm(np.nan_to_num(fitted.covariances), 2, axis=(1, 2)))
     corners.reject(worst > config.max_deviation * spacing, "too uncertain")
+    turned = _edges_turned_by(fitted.shapes[:, 2:4], affines)
+    corners.reject(turned > np.radians(config.max_turn_deg), "edges that run otherwise")
     _judge_colours(board, corners, config)
     _judge_places(board, corners, config)
     return corners
+
+
+def _edges_turned_by(angles: Float64[np.ndarray, "N 2"], affines: Affines) -> Float64[np.ndarray, " N"]:
+    """The greater turn of both edges against the board's lines, radians; of normals without a sign."""
+    along = np.arctan2(affines[:, 0], -affines[:, 1])
+    return np.abs((angles - along + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
 
 
 def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None:

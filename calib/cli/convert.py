@@ -63,9 +63,11 @@ class ConvertOptions:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(ConvertOptions, "convert", words, EXAMPLES)
+    from sfm.io.atomic import check_writable
     from sfm.io.camera_exchange import format_of, read_camera_set, read_history, write_camera_set, write_poses_beside
 
     name = format_of(options.output, options.to)
+    check_writable(options.output)
     if options.output.exists() and options.source.exists() and options.output.samefile(options.source):
         raise ConfigError("is both source and target", path=options.output, remedy="choose another -o")
     source, cameras = read_camera_set(options.source, _size(options.size))

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import ast
-import errno
-import io
 import json
-import os
 from pathlib import Path
 
 import cv2
@@ -159,28 +156,3 @@ def test_corners_are_written_as_json_or_not_at_all(photos, tmp_path, capsys):
     words = ["detect", str(tmp_path / "photos"), "--board", BOARD.spec, "-o", str(tmp_path / "c.txt")]
     assert main(words) == ExitCode.USAGE
     assert "must end in .json" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(not os.path.exists("/proc/self"), reason="a folder that nobody can write to")
-@pytest.mark.parametrize("words", [
-    ["camera", "photos", "--board", BOARD.spec, "-o", "/proc/c.toml"],
-    ["camera", "photos", "--board", BOARD.spec, "-o", "c.toml", "--suggest", "/proc/n.svg"],
-    ["stereo", "photos", "others", "--board", BOARD.spec, "-o", "/proc/r.toml"],
-    ["report", "c.toml", "photos", "-o", "/proc/r.html"],
-    ["check", "c.toml", "photos", "--suggest", "/proc/n.svg"],
-    ["detect", "photos", "--board", BOARD.spec, "-o", "/proc/c.json"],
-])  # fmt: skip
-def test_a_file_that_cannot_be_written_is_known_before_photos_are_looked_at(words, monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(words) == ExitCode.BAD_INPUT
-    assert "error: /proc/" in capsys.readouterr().err
-
-
-def test_a_screen_that_cannot_be_written_to_is_no_bug(photos, tmp_path, monkeypatch, capsys):
-    class Full(io.StringIO):
-        def flush(self):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("sys.stdout", Full())
-    assert main(["detect", str(tmp_path / "photos"), "--board", BOARD.spec, "--no-cache"]) == ExitCode.BAD_INPUT
-    assert capsys.readouterr().err.endswith("error: standard output: no space left on device\n")
