@@ -141,6 +141,7 @@ def calibrate(
         rejected += more
         if len(system.observations) < config.min_views:
             return Rejected("too_few_views", _told(len(system.observations), config.min_views, rejected))
+        fit = fit.for_corners(system.observations)
     checked = check_determined(fit, system, summary)
     if isinstance(checked, Rejected):
         return checked

@@ -99,6 +99,14 @@ def shape_shown(kind: ShapeKind, points: FloatArray, views: Int64[np.ndarray, " 
     return board_shape(kind, points, views >= _VIEWS_THAT_TELL)
 
 
+def shape_still_shown(shape: BoardShape, views: Int64[np.ndarray, " P"]) -> BoardShape:
+    """The same board, now that so many views show each point: what fewer than two show goes back to its place."""
+    movable = views >= _VIEWS_THAT_TELL
+    if shape.kind not in ("height", "free") or np.array_equal(np.any(shape.basis, axis=(1, 2)), movable):
+        return shape
+    return board_shape(shape.kind, shape.given, movable).moved_as(shape.displacements)
+
+
 def smooth_shape(kind: ShapeKind, points: FloatArray, movable: BoolArray) -> BoardShape:
     """The undeformed board of what is smooth of a family: polynomials in x and y where every point has its own place.
 

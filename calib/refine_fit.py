@@ -77,8 +77,7 @@ class Fit:
 
     def for_corners(self, observations: Observations) -> Fit:
         """With the board of which those points may move that enough of these views show."""
-        shown = np.bincount(observations.rows, minlength=len(observations.board))
-        return dataclasses.replace(self, shape=shape_shown(self.config.shape, observations.board, shown))
+        return dataclasses.replace(self, shape=shape_shown(self.config.shape, observations.board, observations.shown))
 
     def seed(self, observations: Observations, errors: Vector) -> Estimate | Rejected:
         """Camera and poses by releasing parameters in stages, on some of the views where there are many."""

@@ -50,8 +50,7 @@ def read_alike(
     turns = fit.config.turns
     if len(observations) < 2 or len(turns) < 2 or not fit.shape.basis.shape[2]:
         return None
-    shown = np.bincount(observations.rows, minlength=len(fit.shape.given)) >= 2
-    movable = np.all([shown[turn.rows] for turn in turns], axis=0)
+    movable = np.all([observations.shown[turn.rows] >= 2 for turn in turns], axis=0)
     ends = ends_of(smooth_shape(fit.config.shape, fit.shape.given, movable), turns)
     if ends is None:
         return None
