@@ -24,7 +24,7 @@ from calib.refine_reject import RejectedView, reject_outliers, sort_out
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_turns import read_alike
 from calib.refine_views import BoardView, Observations
-from calib.zhang import find_start
+from calib.zhang import Homographies, find_start
 from sfm.core.arrays import Points3D, Value, Vector
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -122,12 +122,13 @@ def calibrate(
     start = find_start(observations, homographies, lens, config.focal_px)
     if isinstance(start, Rejected):
         return start
-    fit = Fit(lens, config, start, _shape(observations, config))
-    # In what is taken from homographies a turn of the board in its plane changes nothing.
+    fit = Fit(lens, config, start, board_shape("flat", board)).for_corners(observations)
     alike = read_alike(fit, observations, homographies)
-    turned_views = _renamed(observations, alike)
-    observations, fit = alike, dataclasses.replace(fit, shape=_shape(alike, config))
-    solved = solve_from_start(fit, observations, homographies)
+    turned_views = _renamed(observations, alike[0]) if alike is not None else []
+    if alike is not None:
+        observations = alike[0]
+        fit = fit.for_corners(observations)
+    solved = _solved(fit, observations, homographies, alike[1] if alike is not None else None)
     if isinstance(solved, Rejected):
         return solved
     system, summary = solved
@@ -140,6 +141,7 @@ def calibrate(
         rejected += more
         if len(system.observations) < config.min_views:
             return Rejected("too_few_views", _told(len(system.observations), config.min_views, rejected))
+        fit = fit.for_corners(system.observations)
     checked = check_determined(fit, system, summary)
     if isinstance(checked, Rejected):
         return checked
@@ -153,10 +155,17 @@ def calibrate(
     return dataclasses.replace(found, turned_views=tuple(n for n in turned_views if n in found.observations.names))
 
 
-def _shape(observations: Observations, config: CalibrationConfig) -> BoardShape:
-    """The undeformed board of the family that was asked for; points that fewer than two views show do not move."""
-    shown = np.bincount(observations.rows, minlength=len(observations.board))
-    return board_shape(config.shape, observations.board, shown >= 2)
+def _solved(
+    fit: Fit, observations: Observations, homographies: Homographies, near: Estimate | None
+) -> tuple[CalibrationSystem, Summary] | Rejected:
+    """Least squares, from an estimate nearby where there is one."""
+    if near is not None:
+        near = dataclasses.replace(near, shape=fit.shape.moved_as(near.shape.displacements))
+        system, summary = fit.solve(observations, near)
+        if system.is_at_minimum(summary.final_cost):
+            return system, summary
+    # In what is taken from homographies a turn of the board in its plane changes nothing.
+    return solve_from_start(fit, observations, homographies)
 
 
 def _renamed(before: Observations, after: Observations) -> list[str]:

@@ -20,13 +20,19 @@ import dataclasses
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from sfm.core.arrays import BoolArray, FloatArray, Value, Vector, readonly
 from sfm.core.geometry.rotation import skew
 
 ShapeKind: TypeAlias = Literal["flat", "scale", "paraboloid", "height", "free"]
 SHAPES: tuple[ShapeKind, ...] = get_args(ShapeKind)
+_VIEWS_THAT_TELL = 2
+"""That show a point, below which photos tell nothing of its place."""
+_DEGREE = 4
+"""Of what counts as smooth: 38 coefficients for all three axes."""
+_NOTHING = 1e-6
+"""Part of a direction that is a rounding error."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +63,15 @@ class BoardShape(Value):
         """The points of the board in this shape."""
         return self.given + self.displacements
 
+    def moved_as(self, displacements: Float64[np.ndarray, "P 3"]) -> BoardShape:
+        """The board of this family that comes closest to some displacements of its points."""
+        if not self.basis.shape[2]:
+            return self
+        basis, wanted = self.basis.reshape(-1, self.basis.shape[2]), displacements.ravel()
+        orthonormal = self.kind in ("height", "free")
+        coefficients = basis.T @ wanted if orthonormal else np.linalg.lstsq(basis, wanted, rcond=None)[0]
+        return dataclasses.replace(self, coefficients=coefficients)
+
     @property
     def bend(self) -> float:
         """Highest over lowest point along z, in the unit of the board."""
@@ -77,6 +92,50 @@ def board_shape(kind: ShapeKind, points: FloatArray, movable: BoolArray | None =
     used = np.ones(len(points), bool) if movable is None else movable
     basis = _basis(kind, points, used)
     return BoardShape(kind, readonly(points, (None, 3)), basis, np.zeros(basis.shape[2]))
+
+
+def shape_shown(kind: ShapeKind, points: FloatArray, views: Int64[np.ndarray, " P"]) -> BoardShape:
+    """The undeformed board of a family of which so many views show each point; what fewer than two show stays."""
+    return board_shape(kind, points, views >= _VIEWS_THAT_TELL)
+
+
+def shape_still_shown(shape: BoardShape, views: Int64[np.ndarray, " P"]) -> BoardShape:
+    """The same board, now that so many views show each point: what fewer than two show goes back to its place."""
+    movable = views >= _VIEWS_THAT_TELL
+    if shape.kind not in ("height", "free") or np.array_equal(np.any(shape.basis, axis=(1, 2)), movable):
+        return shape
+    return board_shape(shape.kind, shape.given, movable).moved_as(shape.displacements)
+
+
+def smooth_shape(kind: ShapeKind, points: FloatArray, movable: BoolArray) -> BoardShape:
+    """The undeformed board of what is smooth of a family: polynomials in x and y where every point has its own place.
+
+    The basis is orthonormal, and what movements and a change of size do to the points that may move is left out.
+    """
+    basis = np.zeros((3 * len(points), 0))
+    at = (np.flatnonzero(movable)[:, None] * 3 + [0, 1, 2]).ravel()
+    if kind != "flat" and len(at):
+        found = board_shape(kind, points, movable).basis if kind in ("scale", "paraboloid") else None
+        ways = _smooth(points[movable], kind) if found is None else found.reshape(len(basis), -1)[at]
+        moves, _ = np.linalg.qr(_movements(points, points[movable].mean(0), True)[at])
+        ways = ways / np.maximum(np.linalg.norm(ways, axis=0), 1e-300)
+        left, strengths, _ = np.linalg.svd(ways - moves @ (moves.T @ ways), full_matrices=False)
+        basis = np.zeros((len(basis), int(np.sum(strengths > _NOTHING))))
+        basis[at] = left[:, : basis.shape[1]]
+    smooth = np.ascontiguousarray(basis.reshape(len(points), 3, -1))
+    return BoardShape(kind, readonly(points, (None, 3)), smooth, np.zeros(smooth.shape[2]))
+
+
+def _smooth(points: FloatArray, kind: ShapeKind) -> FloatArray:
+    """(3P, m) orthonormal polynomials of up to some degree, for displacements along z or all three axes."""
+    low, high = points.min(0), points.max(0)
+    x, y = ((2 * points - low - high) / np.maximum(high - low, 1e-300))[:, :2].T
+    powers = np.polynomial.legendre.legvander2d(x, y, (_DEGREE, _DEGREE))
+    total = np.add.outer(np.arange(_DEGREE + 1), np.arange(_DEGREE + 1)).ravel()
+    left, strengths, _ = np.linalg.svd(powers[:, total <= _DEGREE], full_matrices=False)
+    left = left[:, strengths > _NOTHING * strengths[0]]
+    axes = np.eye(3)[:, 2:] if kind == "height" else np.eye(3)
+    return np.kron(left, axes)
 
 
 def _basis(kind: ShapeKind, points: FloatArray, used: np.ndarray) -> FloatArray:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from calib.board_turns import BoardTurn
-from calib.refine_board import BoardShape, ShapeKind
+from calib.refine_board import BoardShape, ShapeKind, shape_shown
 from calib.refine_lenses import Lens
 from calib.refine_system import CalibrationSystem, Estimate
 from calib.refine_views import Observations
@@ -74,6 +74,10 @@ class Fit:
     config: CalibrationConfig
     start: Start
     shape: BoardShape
+
+    def for_corners(self, observations: Observations) -> Fit:
+        """With the board of which those points may move that enough of these views show."""
+        return dataclasses.replace(self, shape=shape_shown(self.config.shape, observations.board, observations.shown))
 
     def seed(self, observations: Observations, errors: Vector) -> Estimate | Rejected:
         """Camera and poses by releasing parameters in stages, on some of the views where there are many."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 
 import numpy as np
 
+from calib.refine_board import shape_still_shown
 from calib.refine_copies import without_copies
 from calib.refine_fit import ROBUST, CalibrationConfig, Fit
 from calib.refine_system import CalibrationSystem
@@ -90,7 +92,8 @@ def reject_outliers(
 ) -> tuple[CalibrationSystem, Summary, list[RejectedView]]:
     """Refits without corners beyond some σ, and without views that are far worse than the others.
 
-    Corners may come back: all are judged again by each new fit, until the choice stays.
+    Corners may come back: all are judged again by each new fit, until the choice stays. A point of the board of which
+    too few corners are left to tell its place has the place that was given.
     """
     config, rejected = fit.config, []
     full, lengths = system.observations, _lengths(system)
@@ -113,7 +116,9 @@ def reject_outliers(
             break
         inside = np.concatenate([kept[full.offsets[v] : full.offsets[v + 1]] for v in views])
         full = full.of_views(views)
-        system, summary = fit.solve(full.of_corners(inside), judge.estimate.of_views(views))
+        some, now = full.of_corners(inside), judge.estimate.of_views(views)
+        now = dataclasses.replace(now, shape=shape_still_shown(now.shape, some.shown))
+        system, summary = fit.solve(some, now)
         judge, before = fit.system(full, system.estimate), inside
     if before is not None:
         names, views_of = full.names, full.view_of

@@ -88,6 +88,11 @@ class Observations(Value):
         """The view of each corner."""
         return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
+    @property
+    def shown(self) -> Int64[np.ndarray, " P"]:
+        """How many views show each point of the board."""
+        return np.bincount(self.rows, minlength=len(self.board))
+
     def of_views(self, views: Sequence[int]) -> Observations:
         """Only these views, in this order."""
         parts = [np.arange(self.offsets[v], self.offsets[v + 1]) for v in views]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.refine import Calibration, calibrate
-from calib.refine_board import BoardShape, board_shape
+from calib.refine_board import BoardShape, board_shape, shape_shown
 from calib.refine_fit import ROBUST, CalibrationConfig, Fit, turned_back
 from calib.refine_lenses import lens_by_name
 from calib.refine_reject import RejectedView, sort_out
@@ -136,5 +136,4 @@ def _poses_only(fit: Fit, observations: Observations, estimate: Estimate) -> Est
 
 def shape_of(config: CalibrationConfig, board: Points3D, cameras: Sequence[AloneCamera]) -> BoardShape:
     """The undeformed board of the family that was asked for; points that fewer than two views show do not move."""
-    shown = sum(np.bincount(one.observations.rows, minlength=len(board)) for one in cameras)
-    return board_shape(config.shape, board, np.asarray(shown >= 2))
+    return shape_shown(config.shape, board, np.sum([one.observations.shown for one in cameras], axis=0))

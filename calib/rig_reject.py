@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.refine_board import shape_still_shown
 from calib.refine_fit import ROBUST
 from calib.refine_reject import RejectedView, limits_of, spread_of, views_that_belong
 from calib.rig_system import RigEstimate, RigSystem
@@ -103,7 +104,9 @@ def reject_from_rig(
             return Rejected("nothing_fits", "a camera has no view left that agrees with the others")
         kept = [_of_views(full, c, kept[c], good[c]) for c in range(len(kept))]
         full, left = full.of_views(good)
-        system, summary = fit.solve(full.of_corners(kept), judge.estimate.of_frames(left))
+        some, now = full.of_corners(kept), judge.estimate.of_frames(left)
+        now = dataclasses.replace(now, shape=shape_still_shown(now.shape, some.shown))
+        system, summary = fit.solve(some, now)
         judge, before = fit.system(full, system.estimate), kept
     for c, mask in enumerate(before or []):
         names, view_of = full.cameras[c].names, full.cameras[c].view_of

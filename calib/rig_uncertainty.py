@@ -36,7 +36,8 @@ class RigCovariance(Value):
     """Covariances of what was estimated.
 
     Attributes:
-        shared: (K, K) of mounts, then free parameters of one camera after the other, then the board's coefficients.
+        shared: (K, K) of mounts, then free parameters of one camera after the other, then the board's coefficients;
+            infinite by frame, on the diagonal, for those of the board that one frame fewer leaves open.
         mounts: (N, 6, 6) of the tangents (ω, υ) of `cams_from_rig`; zero for the first.
         sigma_params: of each camera by the names of its free parameters.
         variance: σ² of one whitened coordinate, px², already in all of them.
@@ -89,11 +90,14 @@ def rig_covariance(found: RigCalibration, *, by_frame: bool = False, alike: bool
     variance = found.sigma_px**2
     if by_frame:
         parts = [_part_of(found, system, f) for f in range(len(found.observations.frames))]
-        shared = jackknife(np.stack([part for part, _ in parts]), np.stack([score for _, score in parts]))
+        reduced, scores = np.stack([part for part, _ in parts]), np.stack([score for _, score in parts])
+        without = jackknife(reduced, scores, system.param_slices[-1].stop)
+        if without is None:
+            return Rejected("undetermined_parameters", "without one of the frames a combination of parameters is open")
+        shared, left_open = without
+        shared[left_open, left_open] = np.inf
     else:
         shared = variance * unit if alike else _by_corner(found, system, unit)
-    if shared is None:
-        return Rejected("undetermined_parameters", "without one of the frames a combination of parameters is open")
     mounts = np.zeros((len(found.names), 6, 6))
     for c, at in enumerate(system.mount_slices):
         if at.stop > at.start:
@@ -116,12 +120,13 @@ def relative_uncertainty(
 ) -> RelativeUncertainty:
     """Of two cameras by their positions in the rig."""
     motion = found.cams_from_rig[camera2] @ found.cams_from_rig[camera1].inverse()
-    J = np.zeros((6, len(covariances.shared)))
+    count = covariances.mount_slices[-1].stop
+    J = np.zeros((6, count))
     # The mount of the first camera is held: its slice is empty.
     one, two = covariances.mount_slices[camera1], covariances.mount_slices[camera2]
     J[:, one] = -motion.adjoint()[:, : one.stop - one.start]
     J[:, two] += np.eye(6)[:, : two.stop - two.start]
-    covariance = J @ covariances.shared @ J.T
+    covariance = J @ covariances.shared[:count, :count] @ J.T
     t = np.array(motion.translation)
     baseline = float(np.linalg.norm(t))
     along = t / max(baseline, 1e-300)

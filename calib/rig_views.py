@@ -69,6 +69,11 @@ class RigObservations(Value):
         """How many cameras saw each frame."""
         return np.bincount(np.concatenate(self.frame_of), minlength=len(self.frames))
 
+    @property
+    def shown(self) -> Int64[np.ndarray, " P"]:
+        """How many views show each point of the board."""
+        return np.sum([camera.shown for camera in self.cameras], axis=0)
+
     def of_corners(self, kept: Sequence[BoolArray]) -> RigObservations:
         """Only the corners that are kept, by camera; views and frames stay."""
         some = [camera.of_corners(mask) for camera, mask in zip(self.cameras, kept, strict=True)]

@@ -3,7 +3,7 @@
 With the board turned along, such a photo is as good as any, and the only sign of it is the camera: its principal point
 lies on the other side of the middle of the image, and what is not symmetric of the distortion has the other sign. So
 the choice of photos that are turned is one of signs, as that of boards' ends, and found in the same way
-(`refine_turns`): about the solution with a camera that is symmetric, again with those that were found turned back,
+(`refine_ends`): about the solution with a camera that is symmetric, again with those that were found turned back,
 until no more are found. It is believed if the errors are then clearly smaller.
 """
 
@@ -15,8 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib.refine import Calibration, CalibrationConfig, calibrate
+from calib.refine_ends import Quadratics, most_likely_turns
 from calib.refine_system import CalibrationSystem, Estimate
-from calib.refine_turns import Quadratics, most_likely_turns, without_poses
+from calib.refine_turns import without_poses
 from calib.refine_views import BoardView
 from sfm.core.arrays import Points3D
 from sfm.core.optim.levenberg_marquardt import StopRules, minimize
@@ -73,7 +74,7 @@ def _against_the_others(found: Calibration) -> np.ndarray | None:
     minimize(system, _RULES)
     A, b = without_poses(CalibrationSystem(found.observations, system.estimate, np.append(free[~skewed], free[skewed])))
     quadratics = _quadratics(found, A, b, [names[k] for k in free[skewed]])
-    return most_likely_turns(quadratics, _COMPOSED, int(skewed.sum()))
+    return most_likely_turns(quadratics, _COMPOSED)
 
 
 def turned_back(view: BoardView) -> BoardView:
@@ -96,10 +97,8 @@ def _symmetric(found: Calibration) -> Estimate:
 def _quadratics(found: Calibration, A: np.ndarray, b: np.ndarray, names: Sequence[str]) -> Quadratics:
     """Costs of views as they are and turned back, in units of the noise; what changes its sign comes last."""
     longer = max(found.camera.width, found.camera.height)
-    signs = np.ones(A.shape[1])
-    signs[-len(names) :] = -1.0
+    same = np.eye(len(names))
     noise = found.sigma_px**2
     prior = 1e-9 * np.diag(A.sum(0)) / noise
     prior[-len(names) :] += [1 / (_CENTER * longer if name[0] == "c" else _SKEWED) ** 2 for name in names]
-    both = np.stack([A, A * np.outer(signs, signs)]) / noise
-    return Quadratics(both, np.stack([b, b * signs]) / noise, np.diag(prior))
+    return Quadratics(A / noise, b / noise, np.stack([same, -same]), np.diag(prior))

@@ -67,7 +67,8 @@ class CalibrationCovariance(Value):
 
     Attributes:
         names: of the shared parameters: the free ones of the camera, then "shape 0" … of the board.
-        shared: (K, K) of them.
+        shared: (K, K) of them. Coefficients of the board that one view fewer leaves open have an infinite variance by
+            view; `frame` holds them as they are then.
         poses: (V, 6, 6) of the tangents (ω, υ) of `cams_from_board`, radians and units of the board.
         frame: (K + 6, K + 6) of the shared parameters and the implied movement ξ of the camera frame.
         variance: σ² of one coordinate of a residual, px², already in all of them.
@@ -107,16 +108,20 @@ def covariance(
     if sigma is None:
         return Rejected("undetermined_parameters", "the views leave a combination of parameters open")
     variance = calibration.sigma_px**2
+    left_open = np.zeros(len(sigma), bool)
     if by_view:
-        shared = jackknife(parts.reduced, parts.scores)
+        found = jackknife(parts.reduced, parts.scores, len(calibration.free_names))
+        if found is None:
+            return Rejected("undetermined_parameters", "without one of the views a combination of parameters is open")
+        shared, left_open = found
     else:
         shared = variance * sigma if alike else _by_corner(calibration, parts, sigma)
-    if shared is None:
-        return Rejected("undetermined_parameters", "without one of the views a combination of parameters is open")
     solved = np.linalg.solve(parts.H, parts.W)
     total = np.linalg.inv(parts.H.sum(0))
     turn = -total @ parts.W.sum(0)
     frame = np.block([[shared, shared @ turn.T], [turn @ shared, turn @ shared @ turn.T + variance * total]])
+    shared = shared.copy()
+    shared[left_open, left_open] = np.inf
     shape = [f"shape {k}" for k in range(len(sigma) - len(calibration.free_names))]
     return CalibrationCovariance(
         names=(*calibration.free_names, *shape),

@@ -16,11 +16,15 @@ import dataclasses
 
 import numpy as np
 
-from sfm.core.arrays import FloatArray, Points3D
+from sfm.core.arrays import BoolArray, FloatArray, Points3D
 from sfm.core.cameras import Camera
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import skew
 
+_SURE = 1e-6
+"""Least pivot, over the diagonal, of a matrix that is not suspected of being singular."""
+_OPEN, _NO_PART = 1e-10, 1e-4
+"""Of what was known of a direction, below which nothing is; and of a unit vector, what is none of its entries."""
 _LEAST_FREEDOM = 1e-3
 """Of a residual's direction, below which the fit has followed all of it."""
 
@@ -90,17 +94,48 @@ def scaled_inverse(S: FloatArray) -> FloatArray | None:
     return (vectors / values) @ vectors.T / np.outer(root, root)
 
 
-def jackknife(reduced: FloatArray, scores: FloatArray) -> FloatArray | None:
-    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ, of views or moments that are left out in turn; None where one cannot be.
+def jackknife(reduced: FloatArray, scores: FloatArray, needed: int) -> tuple[FloatArray, BoolArray] | None:
+    """(V − 1)/V Σ (θ₋ᵥ − mean)(…)ᵀ, of views or moments that are left out in turn; and what that leaves open (K,).
+
+    A view may be one of two that show a point of the board. Without it the place of this point is open, and the camera
+    is not. What is open stays as it is when the view is left out: its own variance is then too small.
 
     Args:
         reduced: (V, K, K) what each adds to S, scores: (V, K) and to the gradient, with its pose eliminated.
+        needed: the first so many must not be open; None where they are.
     """
-    S, steps = reduced.sum(0), []
+    S, steps, left_open = reduced.sum(0), [], np.zeros(scores.shape[1], bool)
+    if not np.all(np.diag(S) > 0):
+        return None
+    scale = 1 / np.sqrt(np.diag(S))
+    scaled = S * np.outer(scale, scale)
     for part, score in zip(reduced, scores, strict=True):
-        inverse = scaled_inverse(S - part)
-        if inverse is None:
+        without, by = scaled - part * np.outer(scale, scale), scale * score
+        step, ways = _solved(without, by), np.zeros((len(S), 0))
+        if step is None:
+            step, ways = _solved_but_open(scaled, without, by)
+        if np.abs(ways[:needed]).max(initial=0.0) > _NO_PART:
             return None
-        steps.append(inverse @ score)
+        left_open |= np.abs(ways).max(1, initial=0.0) > _NO_PART
+        steps.append(scale * step)
     apart = np.array(steps) - np.mean(steps, axis=0)
-    return (len(steps) - 1) / len(steps) * apart.T @ apart
+    return (len(steps) - 1) / len(steps) * apart.T @ apart, left_open
+
+
+def _solved(S: FloatArray, score: FloatArray) -> FloatArray | None:
+    """S⁻¹ s, None where S may be singular; its diagonal is about one."""
+    try:
+        root = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.diag(root).min() ** 2 > _SURE:
+        return None
+    return np.linalg.solve(root.T, np.linalg.solve(root, score))
+
+
+def _solved_but_open(S: FloatArray, without: FloatArray, score: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The least step that solves what is left of S, and the directions (K, m) that are open in it, of unit length."""
+    values, vectors = np.linalg.eigh(without)
+    told = values > np.maximum(_OPEN * np.einsum("ik,ij,jk->k", vectors, S, vectors, optimize=True), 1e-15 * values[-1])
+    known = vectors[:, told]
+    return known @ ((known.T @ score) / values[told]), vectors[:, ~told]

@@ -85,7 +85,7 @@ def hold_out(
     folds = min(folds, len(views))
     order = rng.permutation(len(views))
     squares, trained = np.empty(len(views)), []
-    plain = dataclasses.replace(config, reject=False)
+    plain = _as_read(config)
     for fold in range(folds):
         held = sorted(order[fold::folds].tolist())
         kept = sorted(set(range(len(views))) - set(held))
@@ -100,6 +100,11 @@ def hold_out(
         counts=np.diff(found.observations.offsets).astype(float),
         training_rms_px=math.sqrt(float(np.mean(np.square(trained)))),
     )
+
+
+def _as_read(config: CalibrationConfig) -> CalibrationConfig:
+    """For views of a calibration, with the corners and the ends that it found."""
+    return dataclasses.replace(config, reject=False, turns=())
 
 
 def pose_only_errors(found: Calibration, observations: Observations, turns: Sequence[BoardTurn] = ()) -> Vector:
@@ -173,7 +178,7 @@ def split_half(
     Returns:
         what the last split was refused for, where most of them are.
     """
-    views, plain = views_of(found.observations), dataclasses.replace(config, reject=False)
+    views, plain = views_of(found.observations), _as_read(config)
     differences, refused = [], None
     for _ in range(splits):
         order = rng.permutation(len(views))
@@ -256,9 +261,9 @@ def choose_lens(
     if isinstance(common, Rejected):
         return common
     for name in lenses:
-        one = dataclasses.replace(config, lens=name, reject=False)
+        one = dataclasses.replace(config, lens=name)
         row = RankedLens(name, len(lens_by_name(name).free_names))
-        found = calibrate(board, common, one)
+        found = calibrate(board, common, _as_read(one))
         if isinstance(found, Rejected):
             rows.append(dataclasses.replace(row, refused=f"{found.reason}: {found.detail}"))
             continue

@@ -1,16 +1,21 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import tracemalloc
 
 import numpy as np
 import pytest
 
+import calib.refine
 from calib.board_turns import BoardTurn, board_turns
 from calib.boards import Board, chessboard, circle_grid
 from calib.check import CameraCheck, check_camera, known_shape
 from calib.refine import Calibration, CalibrationConfig, calibrate
+from calib.refine_ends import Quadratics, most_likely_turns
+from calib.refine_turns import read_alike
 from calib.refine_views import BoardView
-from calib.uncertainty_holdout import HeldOut, hold_out
+from calib.uncertainty_holdout import HeldOut, choose_lens, hold_out
 from tests.calib.boards_in_space import LENS, poses_before, seen
 
 EVEN, SQUARE = chessboard(8, 6, 0.03), circle_grid(7, 7, 0.03)
@@ -90,6 +95,43 @@ def test_where_turns_change_nothing_of_the_shape_views_stay_as_they_are(shape, r
     assert found.turned_views == ()
 
 
+def test_a_square_board_that_is_bent_one_way_is_read_alike_up_to_what_its_bend_does_not_tell(rng):
+    """Half a turn changes nothing of a paraboloid: of its four turns two are told apart."""
+    points = np.array(SQUARE.points3D)
+    points -= (points.min(0) + points.max(0)) / 2
+    points[:, 2] += 1e-3 * (1 - (points[:, 0] / points[:, 0].max()) ** 2)
+    views = [view for view in seen(LENS, points, poses_before(LENS, 14, rng), rng, 0.05) if len(view.corner_ids) > 20]
+    config = dataclasses.replace(CONFIG, shape="paraboloid")
+    alike = calibrate(SQUARE.points3D, views, config)
+    assert isinstance(alike, Calibration)
+    mixed = [read_from(view, SQUARE, {2: 1, 5: 2, 7: 3}.get(v, 0)) for v, view in enumerate(views)]
+    found = calibrated(SQUARE, mixed, config)
+    assert found.turned_views == (views[2].name, views[7].name)
+    np.testing.assert_allclose(found.camera.params, alike.camera.params, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", ["paraboloid", "free"])
+def test_telling_ends_apart_takes_little_memory(shape, rng):
+    board = chessboard(10, 10, 0.03)
+    views, config = photos(board, 5e-4, 24, rng), dataclasses.replace(CONFIG, shape=shape)
+    peaks = []
+    for turns in ((), board_turns(board)):
+        tracemalloc.start()
+        assert calibrate(board.points3D, views, dataclasses.replace(config, turns=turns))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] < 1.1 * peaks[0] + 10e6
+
+
+def test_ends_are_told_apart_once_for_a_lens_and_not_for_its_folds(rng, monkeypatch):
+    asked = []
+    monkeypatch.setattr(calib.refine, "read_alike", lambda fit, *rest: asked.append(fit) or read_alike(fit, *rest))
+    views = photos(SQUARE, 5e-4, 14, rng)
+    config = dataclasses.replace(CONFIG, shape="paraboloid", turns=board_turns(SQUARE))
+    assert choose_lens(SQUARE.points3D, views, config, lenses=("radial", "opencv4"), folds=5)
+    assert sum(len(fit.config.turns) > 1 for fit in asked) == 2
+
+
 def test_photos_of_a_flat_board_stay_as_they_were_read(rng):
     for _ in range(5):
         assert calibrated(EVEN, photos(EVEN, 0.0, 12, rng)).turned_views == ()
@@ -140,3 +182,17 @@ def calibrate_as_read(views: list[BoardView]) -> Calibration:
     found = calibrate(EVEN.points3D, views, dataclasses.replace(CONFIG, reject=False))
     assert isinstance(found, Calibration)
     return found
+
+
+def test_the_choice_of_turns_is_that_of_trying_all(rng):
+    """Signs of one coefficient: of five views, each as it agrees with the sum of the others."""
+    for _ in range(20):
+        A = rng.uniform(0.5, 2.0, (5, 1, 1))
+        b = rng.choice([-1.0, 1.0], (5, 1)) * rng.uniform(20, 40, (5, 1))
+        quadratics = Quadratics(A, b, np.array([[[1.0]], [[-1.0]]]), np.array([[0.1]]))
+        found = most_likely_turns(quadratics, np.array([[0, 1], [1, 0]]))
+        assert found is not None
+        choices = np.array(list(itertools.product((0, 1), repeat=5)))
+        sums = np.abs(((1 - 2 * choices) * b[:, 0]).sum(1))
+        best = choices[sums.argmax()]
+        np.testing.assert_array_equal(found, best if best.sum() < 3 else 1 - best)
