@@ -25,16 +25,8 @@ from calib.refine_board import ShapeKind
 from calib.refine_views import gather
 from calib.turned_photos import turned_photos
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import (
-    HeldOut,
-    RankedLens,
-    SplitHalf,
-    choose_lens,
-    fit_poses,
-    hold_out,
-    split_half,
-    views_of,
-)
+from calib.uncertainty_holdout import HeldOut, SplitHalf, fit_poses, hold_out, split_half, views_of
+from calib.uncertainty_lenses import RankedLens, choose_lens
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from calib.yardstick import Yardstick, measure_lens
 from sfm.core.arrays import Points3D, Value

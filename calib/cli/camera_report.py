@@ -19,7 +19,8 @@ from calib.cli.yardstick_text import yardstick_json, yardstick_lines
 from calib.next_views import SuggestedView
 from calib.refine import Calibration
 from calib.uncertainty import CalibrationCovariance, rms_uncertainty, uncertainty_map
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf
+from calib.uncertainty_holdout import HeldOut, SplitHalf
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import RankedShape
 from sfm.core.errors import Rejected
 from sfm.io.camera_records import BoardRecord, CameraRecord, Fact, ParameterCovariance

@@ -129,7 +129,7 @@ def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]]
     from calib.cli.refusals import no_camera
     from calib.refine_fit import CalibrationConfig
     from calib.refine_lenses import Lens, lens_by_name
-    from calib.uncertainty_holdout import choose_lens
+    from calib.uncertainty_lenses import choose_lens
 
     found: dict[str, Lens] = {}
     for name, one in seen.items():

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from calib.diagnose import Finding
-from calib.uncertainty_holdout import RankedLens
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import CANDIDATES, RankedShape
 from calib.yardstick import Yardstick
 

@@ -9,7 +9,7 @@ import numpy as np
 from calib.cli.tried import with_what_was_measured, with_what_was_tried
 from calib.diagnose import Finding
 from calib.refine import CalibrationConfig
-from calib.uncertainty_holdout import RankedLens
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import RankedShape, choose_shape
 from calib.yardstick import Yardstick
 from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen
