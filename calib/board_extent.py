@@ -1,9 +1,10 @@
-"""Whether a photo shows a chessboard of another size than the one that was found in it.
+"""Whether a photo shows a board of another size than the one that was found in it.
 
 A finder that is asked for fewer columns or rows than there are takes a part of the board, and one that is asked for
-more may take corners of the outermost squares for crossings. Both look like a board that was found. The squares tell:
+more may take corners of the outermost squares for crossings. Both look like a board that was found. The print tells:
 around the corners of a chessboard there is one more ring of squares that alternate, and no second one. In 141 photos of
-eight sets the mean difference of neighbours in these rings is 0.8 to 1.05 and below 0.35 of that within.
+eight sets the mean difference of neighbours in these rings is 0.8 to 1.05 and below 0.35 of that within. Around a grid
+of circles there are none; what is darker than its surroundings at the places of further circles is one of them.
 """
 
 from __future__ import annotations
@@ -25,13 +26,18 @@ _ALTERNATES, _DOES_NOT = 0.6, 0.3
 _PATCH, _CLOSE = 0.1, 0.25
 """Of a square: where it is looked at, beside its middle, in the four directions; and how far from their corners the
 outer ones are, which may be cut narrow."""
+_BEYOND = 2
+"""Lines of circles that are looked for beyond each side."""
+_IN_CIRCLE = 0.5
+"""Of the radius, where a circle is looked at."""
+_DIRECTIONS = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
 _FEWEST, _MOSTLY = 3, 0.75
 """Photos that tell, and part of them that must agree, for the size to be certain."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ShownSize:
-    """Columns and rows of inner corners, and how many of the photos that tell show them."""
+    """Columns and rows as `Board` counts them, and how many of the photos that tell show them."""
 
     columns: int
     rows: int
@@ -45,21 +51,25 @@ class ShownSize:
 
 
 def size_that_is_shown(board: Board, photos: Sequence[tuple[UInt8[np.ndarray, "_ _"], BoardView]]) -> ShownSize | None:
-    """What more than half of the photos show; None if it is the board, or cannot be told.
+    """The columns, and the rows, that more than half of the photos show; None if it is the board, or cannot be told.
 
     Args:
-        board: that was found in the photos; only of chessboards something can be said.
+        board: that was found in the photos; of boards with markers nothing need be said.
     """
-    if board.kind != "chessboard":
+    if board.has_markers:
         return None
-    told = [size for size in (_in_photo(grey, board, seen) for grey, seen in photos) if size is not None]
-    sizes = [size for size in sorted(set(told)) if told.count(size) > len(told) / 2]
-    if not sizes or sizes[0] == board.grid:
+    in_photo = _of_circles if board.has_circles else _of_squares
+    told = [size for size in (in_photo(grey, board, seen) for grey, seen in photos) if size is not None]
+    sides = [
+        [side for side in sorted(set(sides)) if sides.count(side) > len(told) / 2] for sides in zip(*told, strict=True)
+    ]
+    if not told or not all(sides) or (sides[0][0], sides[1][0]) == board.grid:
         return None
-    return ShownSize(*sizes[0], told.count(sizes[0]), len(told))
+    size = sides[0][0], sides[1][0]
+    return ShownSize(*size, told.count(size), len(told))
 
 
-def _in_photo(grey: UInt8[np.ndarray, "H W"], board: Board, seen: BoardView) -> tuple[int, int] | None:
+def _of_squares(grey: UInt8[np.ndarray, "H W"], board: Board, seen: BoardView) -> tuple[int, int] | None:
     """None where nothing can be told; sides that are not in the photo, or undecided, are taken for right."""
     columns, rows = board.grid
     x, y = np.meshgrid(np.arange(-2, columns + 1), np.arange(-2, rows + 1))
@@ -101,12 +111,47 @@ def _differences(bright: Float64[np.ndarray, "R C"]) -> Vector:
 
 
 def _brightness(grey: UInt8[np.ndarray, "H W"], board: Board, seen: BoardView, places: Points2D) -> Vector:
-    """(N,) mean of some pixels at places given in squares from the first corner; NaN outside the photo."""
+    """(N,) of squares at places given in squares from the first corner; NaN outside the photo."""
     steps = _PATCH * np.array([[0.0, 0.0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+    return _looked_up(grey, board, seen, places, steps).mean(axis=1)
+
+
+def _of_circles(grey: UInt8[np.ndarray, "H W"], board: Board, seen: BoardView) -> tuple[int, int] | None:
+    """As `_of_squares`; a line of circles beyond the ones that were found may be followed by a second one."""
+    columns, rows = board.grid
+    column, row = np.meshgrid(np.arange(-_BEYOND, columns + _BEYOND), np.arange(-_BEYOND, rows + _BEYOND))
+    staggered = board.kind == "acircles"
+    places = np.column_stack([(2 * column + row % 2 if staggered else column).ravel(), row.ravel()]).astype(np.float64)
+    radius, blank = board.detail_m / 2 / board.pitch_m, board.clear_radius_m / board.pitch_m
+    inside = _looked_up(grey, board, seen, places, _IN_CIRCLE * radius * _DIRECTIONS).mean(axis=1)
+    outside = np.array(
+        [_clear_mean(part) for part in _looked_up(grey, board, seen, places, (radius + blank) / 2 * _DIRECTIONS)]
+    )
+    contrast = (outside - inside).reshape(column.shape)
+    within = slice(_BEYOND, -_BEYOND)
+    usual = float(np.nanmedian(contrast[within, within]))
+    if not usual > 0:
+        return None
+    sizes = [columns, rows]
+    for axis, grid in enumerate((contrast.T, contrast)):
+        for lines in (grid[:_BEYOND][::-1], grid[-_BEYOND:]):
+            there = [_clear_mean(line[within]) > _ALTERNATES * usual for line in lines]
+            sizes[axis] += [*there, False].index(False)
+    return sizes[0], sizes[1]
+
+
+def _looked_up(
+    grey: UInt8[np.ndarray, "H W"],
+    board: Board,
+    seen: BoardView,
+    places: Float64[np.ndarray, "N 2"],
+    steps: Float64[np.ndarray, "S 2"],
+) -> Float64[np.ndarray, "N S"]:
+    """The pixels at so many steps from places, all by `Board.pitch_m`; NaN outside the photo."""
     asked = (places[:, None] + steps).reshape(-1, 2) * board.pitch_m
     pixels, _ = predicted(asked, board.points3D[seen.corner_ids, :2], seen.points2D)
     at = np.floor(pixels).astype(int)
     inside = ((at >= 0) & (at < [grey.shape[1], grey.shape[0]])).all(axis=1)
     values = np.full(len(at), np.nan)
     values[inside] = grey[at[inside, 1], at[inside, 0]]
-    return values.reshape(-1, len(steps)).mean(axis=1)
+    return values.reshape(-1, len(steps))

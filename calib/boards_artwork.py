@@ -77,9 +77,25 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if not isinstance(number, int):
-        known = [word for word in dir(cv2.aruco) if word.startswith("DICT_")]
-        raise ValueError(f"unknown set of markers {name!r}; known are {', '.join(known)}")
+        raise ValueError(f"unknown set of markers {name!r}; known are {', '.join(dictionary_names())}")
     return cv2.aruco.getPredefinedDictionary(number)
+
+
+def dictionary_names(markers: int = 0) -> list[str]:
+    """OpenCV's sets of at least so many markers, each by one name."""
+    names = [word for word in dir(cv2.aruco) if word.startswith("DICT_")]
+    once = {getattr(cv2.aruco, name): name for name in names}  # some are there as 36H11 and as 36h11
+    return [name for name in once.values() if len(marker_dictionary(name).bytesList) >= markers]
+
+
+def markers_of(board: Board) -> int:
+    """How many markers a board has; their numbers are 0, 1, 2 …"""
+    match board.kind:
+        case "charuco":
+            return len(marker_squares(board.columns, board.rows))
+        case "aprilgrid":
+            return board.columns * board.rows
+    return 0
 
 
 def marker_cells(dictionary: str, marker: int, border: int) -> Bool[np.ndarray, "S S"]:

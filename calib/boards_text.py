@@ -11,11 +11,13 @@ Lengths have a unit: mm, cm, m or in.
 
 from __future__ import annotations
 
+import difflib
 import re
 import tomllib
 from typing import Any
 
 from calib.boards import KINDS, Board, aprilgrid, asymmetric_circle_grid, charuco, chessboard, circle_grid
+from calib.boards_artwork import dictionary_names, marker_dictionary, markers_of
 from sfm.core.errors import ConfigError
 
 UNITS_M = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
@@ -44,16 +46,41 @@ def make_board(
     """A board of any kind; the meaning of the numbers is that of `Board`.
 
     Raises:
-        ConfigError: the kind is unknown, or a number is out of its range.
+        ConfigError: the kind is unknown, a number is out of its range, or the set of markers is unknown or too small.
     """
     if kind not in KINDS:
         raise ConfigError(f"unknown kind of board {kind!r}", remedy=f"kinds are {', '.join(KINDS)}")
     if dictionary and not dictionary.startswith("DICT_"):
         dictionary = f"DICT_{dictionary}"
     try:
-        return _MAKERS[kind](columns, rows, pitch_m, detail_m, dictionary)
+        board = _MAKERS[kind](columns, rows, pitch_m, detail_m, dictionary)
     except ValueError as error:
         raise ConfigError(f"{kind}: {error}") from error
+    _check_markers(board)
+    return board
+
+
+def _check_markers(board: Board) -> None:
+    """Raises ConfigError where a board has markers that there are not."""
+    needed = markers_of(board)
+    if not needed:
+        return
+    told = f"{board.kind} of {board.columns}x{board.rows} has {needed} markers"
+    enough = dictionary_names(needed)
+    if not enough:
+        raise ConfigError(f"{told}, more than any set of markers", remedy="choose fewer columns and rows")
+    try:
+        count = len(marker_dictionary(board.dictionary).bytesList)
+    except ValueError as error:
+        near = difflib.get_close_matches(board.dictionary, enough, n=3)
+        raise ConfigError(
+            f"{board.kind}: unknown set of markers {board.dictionary!r}",
+            remedy=f"{'perhaps' if near else 'known are'} {', '.join(near or enough)}",
+        ) from error
+    if count < needed:
+        family = board.dictionary.rpartition("_")[0]
+        like = [name for name in enough if name.rpartition("_")[0] == family] or enough
+        raise ConfigError(f"{told}, {board.dictionary} has {count}", remedy=f"{' or '.join(like)} would do")
 
 
 def parse_length(text: str) -> float:

@@ -19,6 +19,7 @@ from calib.boards import Board
 from calib.detect_crossings import expectations, fit_crossings
 from calib.detect_gates import Corners, DetectConfig, fitted_circles, fitted_crossings, on_board
 from calib.detect_grids import Found, candidates
+from calib.detect_lines import absent_lines, moved
 from calib.detect_neighbours import Affines, local_affines, predicted
 from sfm.core.arrays import Points2D, Value, readonly
 from sfm.core.errors import Rejected
@@ -86,6 +87,8 @@ def detect_board(
     best_finder = ""
     for found in candidates(grey, board):
         corners = _precise(grey, board, found, config)
+        if corners is not None and board.kind == "chessboard":
+            corners = _with_all_lines(grey, board, corners, config)
         if corners is not None and (best is None or corners.kept.sum() > best.kept.sum()):
             best, best_finder = corners, found[0]
         if best is not None and best.kept.sum() == len(board.points3D):
@@ -116,8 +119,9 @@ def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig)
     _, ids, points2D = found
     order = np.argsort(ids, kind="stable")
     ids, points2D = np.asarray(ids, np.int64)[order], points2D[order]
-    inside = ((points2D > 0) & (points2D < [grey.shape[1], grey.shape[0]])).all(axis=1)
-    ids, points2D = ids[inside], points2D[inside]
+    if board.kind != "chessboard":  # whose order tells which corner is which, so that all are kept for now
+        inside = ((points2D > 0) & (points2D < [grey.shape[1], grey.shape[0]])).all(axis=1)
+        ids, points2D = ids[inside], points2D[inside]
     try:
         affines = local_affines(on_board(board, ids), points2D)
     except ValueError:
@@ -133,6 +137,16 @@ def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig)
     if board.has_markers:
         corners = _completed(grey, board, corners, config)
     return _by_neighbours(grey, board, corners, config)
+
+
+def _with_all_lines(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> Corners:
+    """A chessboard as it is read if it has an outer line where the finder has put none."""
+    for step, line in absent_lines(board, corners):
+        found = moved(board, corners, step, line)
+        other = _precise(grey, board, found, config) if found is not None else None
+        if other is not None and not any(True for _ in absent_lines(board, other)):
+            return other
+    return corners
 
 
 def _as_printed(

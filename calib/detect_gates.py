@@ -14,12 +14,10 @@ from jaxtyping import Float64, Int64
 from calib.boards import Board
 from calib.detect_circles import fit_circles, without_shifts
 from calib.detect_crossings import Expectations, fit_crossings
-from calib.detect_neighbours import Affines, local_affines, predicted
+from calib.detect_neighbours import Affines
+from calib.detect_places import misplaced
 from sfm.core.arrays import Mask, Points2D
 from sfm.core.imaging.noise import noise_sigma
-
-_LEAST_BEND = 0.08
-"""Of the distance of neighbours; at the edge of a fisheye image the best quadratic function is off by 0.06."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +43,10 @@ class DetectConfig:
     max_deviation: float = 0.05
     """A corner's standard deviation in its worst direction by the distance to its neighbours: above, its fit went
     astray, as when both edges become one."""
+
+    max_turn_deg: float = 25.0
+    """An edge of a crossing that is turned by more from where the neighbours of the corner lie is none of the board's:
+    at the outer corners of the outer squares a fit finds two edges of its own. Photos of boards stay below 8."""
 
     max_bend: float = 6.0
     """Most deviation from where the neighbours want a corner, by the median deviation of the board's corners."""
@@ -107,9 +109,17 @@ def fitted_crossings(
     corners.reject(jumped, "jumped")
     worst = np.sqrt(np.linalg.norm(np.nan_to_num(fitted.covariances), 2, axis=(1, 2)))
     corners.reject(worst > config.max_deviation * spacing, "too uncertain")
+    turned = _edges_turned_by(fitted.shapes[:, 2:4], affines)
+    corners.reject(turned > np.radians(config.max_turn_deg), "edges that run otherwise")
     _judge_colours(board, corners, config)
     _judge_places(board, corners, config)
     return corners
+
+
+def _edges_turned_by(angles: Float64[np.ndarray, "N 2"], affines: Affines) -> Float64[np.ndarray, " N"]:
+    """The greater turn of both edges against the board's lines, radians; of normals without a sign."""
+    along = np.arctan2(affines[:, 0], -affines[:, 1])
+    return np.abs((angles - along + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
 
 
 def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None:
@@ -124,18 +134,12 @@ def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None
 
 
 def _judge_places(board: Board, corners: Corners, config: DetectConfig) -> None:
-    """Rejects the corner that its neighbours disagree with most, until none stands out."""
-    while (kept := corners.kept).sum() > 4:
-        known, points2D = on_board(board, corners.ids[kept]), corners.points2D[kept]
-        wanted, gain = predicted(known, known, points2D)
-        off = np.linalg.norm(wanted - points2D, axis=1) / gain
-        scale = np.median(np.linalg.svd(local_affines(known, points2D), compute_uv=False)) * 2 * board.clear_radius_m
-        limit = max(config.max_bend * float(np.median(off)), _LEAST_BEND * scale, 0.5)
-        if off.max() <= limit:
-            return
-        worst = np.zeros(len(kept), bool)
-        worst[np.flatnonzero(kept)[np.argmax(off)]] = True
-        corners.reject(worst, "off the grid of its neighbours")
+    """What neighbours say of the corners that are left."""
+    bad = corners.kept
+    bad[bad] = misplaced(
+        on_board(board, corners.ids[bad]), corners.points2D[bad], board.clear_radius_m, config.max_bend
+    )
+    corners.reject(bad, "off the grid of its neighbours")
 
 
 def fitted_circles(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 
 from calib.detect_plane import LensedPlane
-from sfm.core.arrays import Points2D
+from sfm.core.arrays import Indices, Points2D
 
 Affines = Float64[np.ndarray, "N 2 2"]
 """∂(image) / ∂(board) at each corner, px per metre."""
 
 _NEAREST = 3
-_FOR_PREDICTION = 16
+FOR_PREDICTION = 16
+"""Neighbours that tell where a corner must be, if there are so many."""
 _LEAST_FOR_QUADRATIC = 9
 _DEGREES = ((2, 12), (3, 16))
 """Of the polynomials through the neighbours that tell how edges bend, and how many these are."""
@@ -24,21 +25,27 @@ _ALIKE = 1.01
 """Distances on the board that differ by less are the same."""
 
 
-def local_affines(board_points: Points2D, points2D: Points2D) -> Affines:
+def local_affines(
+    board_points: Points2D, points2D: Points2D, at: Indices | None = None
+) -> Float64[np.ndarray, "A 2 2"]:
     """The linear part of the map from board to image around each corner, from its nearest neighbours.
 
     Args:
         board_points: (x, y) on the board in metres; row by row the partners of `points2D`.
+        at: rows of the corners that are asked for; all by default.
     Raises:
         ValueError: there are fewer than three corners, or all are on one line.
     """
     if len(board_points) < 3 or np.linalg.matrix_rank(board_points - board_points[0], tol=1e-9) < 2:
         raise ValueError(f"expected three corners that are not on one line, got {len(board_points)}")
-    between, distance = _distances(board_points)
-    near = distance <= _ALIKE * np.sort(distance, axis=1)[:, min(_NEAREST, len(distance) - 1), None]
-    affines, fits = _fitted_affines(between, points2D, near)
+    asked = np.arange(len(board_points)) if at is None else at
+    between = board_points[None] - board_points[asked][:, None]
+    moved = points2D[None] - points2D[asked][:, None]
+    distance = np.linalg.norm(between, axis=2)
+    near = distance <= _ALIKE * np.sort(distance, axis=1)[:, min(_NEAREST, len(board_points) - 1), None]
+    affines, fits = _fitted_affines(between, moved, near)
     if not fits.all():  # neighbours on one line, as at the end of a torn row: then all corners are asked
-        everywhere, _ = _fitted_affines(between, points2D, np.ones_like(near))
+        everywhere, _ = _fitted_affines(between, moved, np.ones_like(near))
         affines = np.where(fits[:, None, None], affines, everywhere)
     return affines
 
@@ -57,10 +64,18 @@ def predicted(
         Their pixels; and by how much the errors of the neighbours are amplified: the deviation of a predicted
         from a measured place, where all errors are 1. At the border of a board it is several times that within.
     """
-    order, steps, _ = _neighbourhoods(targets, board_points, _FOR_PREDICTION)
+    wanted, gain, _ = foretold(targets, board_points, points2D)
+    return wanted, gain
+
+
+def foretold(
+    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"]
+) -> tuple[Points2D, Float64[np.ndarray, " N"], Int64[np.ndarray, "N M"]]:
+    """What `predicted` says, and the rows of the neighbours that say it, at most `FOR_PREDICTION`."""
+    order, steps, _ = _neighbourhoods(targets, board_points, FOR_PREDICTION)
     # Where neighbours are on a line, the pseudo-inverse takes the flattest function through them.
     weights = np.linalg.pinv(_terms(steps, 2 if order.shape[1] >= _LEAST_FOR_QUADRATIC else 1), rcond=1e-4)[:, 0]
-    return np.einsum("nk,nkd->nd", weights, points2D[order]), np.sqrt(1 + np.square(weights).sum(axis=1))
+    return np.einsum("nk,nkd->nd", weights, points2D[order]), np.sqrt(1 + np.square(weights).sum(axis=1)), order
 
 
 def local_curvatures(
@@ -120,7 +135,7 @@ def local_slopes(
         The gradient, 1 / px; and what the plane leaves of the values by the distance of the neighbours: the gradient
         between two of them differs by so much. Inf where they do not tell.
     """
-    order, _, _ = _neighbourhoods(targets, board_points, _FOR_PREDICTION)
+    order, _, _ = _neighbourhoods(targets, board_points, FOR_PREDICTION)
     near = points2D[order]
     near = near - near.mean(axis=1, keepdims=True)
     spread = near.swapaxes(1, 2) @ near
@@ -155,16 +170,12 @@ def _terms(steps: np.ndarray, degree: int) -> np.ndarray:
     return np.stack([x ** (n - k) * y**k for n in range(degree + 1) for k in range(n + 1)], axis=2)
 
 
-def _distances(board_points: Points2D) -> tuple[np.ndarray, np.ndarray]:
-    between = board_points[None] - board_points[:, None]
-    return between, np.linalg.norm(between, axis=2)
+def _fitted_affines(between: np.ndarray, moved: np.ndarray, near: np.ndarray) -> tuple[Affines, Bool[np.ndarray, " N"]]:
+    """Least squares over the neighbours, and whether they determine it.
 
-
-def _fitted_affines(
-    between: np.ndarray, points2D: Points2D, near: np.ndarray
-) -> tuple[Affines, Bool[np.ndarray, " N"]]:
-    """Least squares over the neighbours, and whether they determine it."""
-    moved = points2D[None] - points2D[:, None]
+    Args:
+        between, moved: (N, K, 2) from the corners that are asked for to all, on the board and in the image.
+    """
     spread = np.einsum("ij,ijk,ijl->ikl", near, between, between)
     image = np.einsum("ij,ijk,ijl->ikl", near, moved, between)
     determinant = np.linalg.det(spread)

@@ -62,7 +62,8 @@ def coverage_figure(found: CameraResiduals) -> str:
     ]
     return svg.figure(
         frame, f"Coverage: {len(points2D)} corners of {len(found.observations)} views, by their residual",
-        [*parts, *svg.ticks(frame)], across="px", legend=svg.color_legend(frame, 0.0, high, "px"),
+        [*parts, *svg.ticks(frame)], across="px",
+        legend=svg.color_legend(frame, 0.0, high, "px", most=float(worst.max())),
     )  # fmt: skip
 
 
@@ -73,13 +74,20 @@ def residual_field_figure(found: CameraResiduals) -> str:
     means, centers = cell_means(found.observations.points2D, found.residuals, found.camera, across)
     if not len(means):
         return svg.figure(frame, "Residual field: too few corners in any cell", [])
-    longest = float(np.quantile(np.hypot(*means.T), _WORST_PART))
-    gain = 0.8 * found.camera.width / across / max(longest, 1e-12)
+    lengths = np.hypot(*means.T)
+    gain = 0.8 * found.camera.width / across / max(float(np.quantile(lengths, _WORST_PART)), 1e-12)
+    gain = min(gain, _gain_within(frame, centers, means))
     parts = [svg.arrow(frame, c, m * gain, svg.ACCENT) for c, m in zip(centers, means, strict=True)]
     return svg.figure(
-        frame, f"Residual field: means over cells, {gain:.0f} times as long (longest {longest:.3f} px)",
+        frame, f"Residual field: means over cells, {gain:.0f} times as long (longest {lengths.max():.3f} px)",
         [*parts, *svg.ticks(frame)], across="px",
     )  # fmt: skip
+
+
+def _gain_within(frame: Frame, starts: FloatArray, shifts: FloatArray) -> float:
+    """The most by which shifts may be multiplied and end in the frame."""
+    room = np.where(shifts > 0, [frame.x1, frame.y1] - starts, starts - [frame.x0, frame.y0])
+    return float(np.min(room / np.maximum(np.abs(shifts), 1e-12)))
 
 
 def cell_means(points2D: FloatArray, values: FloatArray, camera: Camera, across: int) -> tuple[FloatArray, FloatArray]:
@@ -117,13 +125,13 @@ def uncertainty_figure(
     deviations, _ = uncertainty_map(found, covariances, distance, across=_ACROSS)
     known = deviations[np.isfinite(deviations)]
     if not len(known):
-        return svg.figure(frame, f"Uncertainty of what is {words}: no pixel has a ray", [])
+        return svg.figure(frame, f"Uncertainty {words}: no pixel has a ray", [])
     low, high = 0.0, float(np.quantile(known, _WORST_PART))
     middle = deviations[deviations.shape[0] // 2, deviations.shape[1] // 2]
     return svg.figure(
-        frame, f"Uncertainty (1 σ) of what is {words}: {middle:.3f} px in the middle, at most {known.max():.3f} px",
+        frame, f"Uncertainty (1 σ) {words}: {middle:.3f} px in the middle, {known.max():.3f} px at most",
         [*svg.cells(frame, deviations, low, high, "px"), *svg.ticks(frame)], across="px",
-        legend=svg.color_legend(frame, low, high, "px"),
+        legend=svg.color_legend(frame, low, high, "px", most=float(known.max())),
     )  # fmt: skip
 
 

@@ -14,6 +14,10 @@ from sfm.core.arrays import FloatArray
 
 WIDTH = 460.0
 """Of a figure's field, px on the screen."""
+_LARGE, _SMALL = 14.0, 11.0
+"""Sizes of titles, px."""
+_WIDE = 0.6
+"""A sign of a wide font over its size, in the mean of words."""
 _MARGIN, _TOP, _LEGEND = 46.0, 26.0, 64.0
 _STOPS = ((0x1B, 0x1F, 0x5A), (0x1F, 0x6F, 0x9F), (0x2A, 0xA8, 0x8B), (0xA9, 0xD0, 0x4B), (0xFD, 0xE8, 0x4A))
 """From little to much: dark to light, so that it can be told in grey as well."""
@@ -62,7 +66,7 @@ def figure(
     """The whole SVG: title above, what is drawn within the frame, words below, a legend at the right."""
     width, height = _MARGIN + WIDTH + (_LEGEND if legend else 12), _TOP + frame.height + (38 if across else 12)
     left, bottom = _MARGIN, _TOP + frame.height
-    words = [text(_MARGIN, 16.0, title, size=14)]
+    words = [_heading(title)]
     if across:
         words.append(text(left + WIDTH / 2, bottom + 32, across, anchor="middle", color="#57606a"))
     return "".join([
@@ -83,6 +87,14 @@ def text(x: float, y: float, words: str, *, anchor: str = "start", size: int = 1
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" font-size="{size}" fill="{color}">{escape(words)}</text>'
     )
+
+
+def _heading(title: str) -> str:
+    """The title: at least as small as to end before the legend, whatever font the reader has."""
+    width = _WIDE * len(title)
+    size = min(_LARGE, max(_SMALL, WIDTH / width))
+    fitted = f' textLength="{WIDTH:g}" lengthAdjust="spacingAndGlyphs"' if width * size > WIDTH + 0.5 else ""
+    return f'<text x="{_MARGIN}" y="16.0" font-size="{size:.3g}" fill="{INK}"{fitted}>{escape(title)}</text>'
 
 
 def dot(frame: Frame, x: float, y: float, radius: float, color: str, *, title: str = "", opacity: float = 1.0) -> str:
@@ -147,8 +159,12 @@ def color_of(value: float, low: float, high: float) -> str:
     return "#" + "".join(f"{channel:02x}" for channel in mixed)
 
 
-def color_legend(frame: Frame, low: float, high: float, unit: str) -> str:
-    """A bar of the colours beside the frame, with its ends and middle in words."""
+def color_legend(frame: Frame, low: float, high: float, unit: str, *, most: float = -math.inf) -> str:
+    """A bar of the colours beside the frame, with its ends and middle in words.
+
+    Args:
+        most: the largest value that is shown; beyond `high` it has the colour of that, and the bar says so.
+    """
     steps, x = 24, _MARGIN + WIDTH + 10
     parts = [
         f'<rect x="{x}" y="{_TOP + frame.height * (1 - (k + 1) / steps):.1f}" width="12" '
@@ -157,7 +173,9 @@ def color_legend(frame: Frame, low: float, high: float, unit: str) -> str:
     ]
     for part in (0.0, 0.5, 1.0):
         y = _TOP + frame.height * (1 - part)
-        parts.append(text(x + 16, min(max(y + 4, _TOP + 9), _TOP + frame.height), f"{low + part * (high - low):.2g}"))
+        beyond = "≥ " if part == 1.0 and most > high else ""
+        number = f"{beyond}{low + part * (high - low):.2g}"
+        parts.append(text(x + 16, min(max(y + 4, _TOP + 9), _TOP + frame.height), number))
     parts.append(text(x, _TOP - 6, unit))
     return "".join(parts)
 

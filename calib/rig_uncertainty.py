@@ -1,9 +1,9 @@
 """How uncertain a calibrated rig is, and what it says of frames that it has not seen.
 
 With unit noise the covariance of what frames share is Σ = S⁻¹ (see `rig_system`). Every corner speaks for itself, by
-its own residual, and what rejection has hidden is made up for, as in `uncertainty`; here the pose that is projected out
-is that of the frame, which the corners of several cameras share. It takes residuals for independent; `by_frame` takes
-only the frames for independent, by leaving out each in turn with one Newton step, as `uncertainty` does with views.
+its own residual, as in `uncertainty`; here the pose that is projected out is that of the frame, which the corners of
+several cameras share. It takes residuals for independent; `by_frame` takes only the frames for independent, by leaving
+out each in turn with one Newton step, as `uncertainty` does with views.
 
 The tangent of the pose of camera 2 relative to camera 1, T = T_2 T_1⁻¹, is  δ_2 − Ad(T) δ_1.  With T = (R, t) and
 δ = (ω, υ) its translation moves by ω × t + υ, and the baseline |t| by υ · t / |t|.

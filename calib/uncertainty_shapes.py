@@ -129,6 +129,11 @@ def _same_corners(one: Calibration, other: Calibration) -> bool:
     return a.names == b.names and np.array_equal(a.offsets, b.offsets) and np.array_equal(a.rows, b.rows)
 
 
+def free_is_too_large(points: int, corners: int) -> bool:
+    """Whether so many corners, of a board of so many points that all are free, take minutes."""
+    return corners * (3.0 * points) ** 2 > _LARGEST_WORK
+
+
 def _fit(board: Points3D, views: Sequence[BoardView], config: CalibrationConfig) -> Calibration | Rejected:
     count = {"flat": 0, "scale": 1, "paraboloid": 3, "height": len(board), "free": 3 * len(board)}[config.shape]
     if sum(len(view.corner_ids) for view in views) * float(count) ** 2 > _LARGEST_WORK:

@@ -79,6 +79,8 @@ def corners(folder: Path, pattern: str, size: tuple[int, int]) -> Iterator[Board
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
     for file in sorted(folder.glob(pattern)):
         image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise SystemExit(f"{file}: is no image that OpenCV can read")
         found, points = cv2.findChessboardCorners(image, size, flags=flags)
         if not found:
             continue
@@ -258,8 +260,8 @@ def judged(camera: Camera, lens: str, bend: float, count: int) -> dict[str, Any]
         rng = np.random.default_rng(trial)
         views = [held_before(camera, bent, center, rng, f"{n}") for n in range(15)]
         found = calibrate(board, views, config)
-        covariances = found and covariance(found)
-        if not covariances or isinstance(found, Rejected):
+        covariances = found if isinstance(found, Rejected) else covariance(found)
+        if isinstance(found, Rejected) or isinstance(covariances, Rejected):
             failed += 1
             continue
         sigma = np.array(list(covariances.deviations.values())[: len(camera.params)])

@@ -94,16 +94,17 @@ def compare(name, folder):
     best = max(theirs, key=lambda detector: sum(0 if c is None else len(c) for c in theirs[detector]))
     detect_board(photos[0], board)  # kernels
     start = time.process_time()
-    ours = [detect_board(photo, board) for photo in photos]
+    found = [detect_board(photo, board) for photo in photos]
     ours_time = time.process_time() - start
+    ours = {k: d for k, d in enumerate(found) if isinstance(d, Detection)}
     told = [
         f"{sum(c is not None for c in theirs[best])}/{len(photos)}",
         f"{sum(0 if c is None else len(c) for c in theirs[best])}",
-        f"{sum(isinstance(d, Detection) for d in ours)}/{len(photos)}",
-        f"{sum(len(d.points2D) for d in ours if d)}",
+        f"{len(ours)}/{len(photos)}",
+        f"{sum(len(d.points2D) for d in ours.values())}",
     ]
     sizes = [photo.shape for photo in photos]
-    common = [k for k, d in enumerate(ours) if d and theirs[best][k] is not None and sizes[k] == sizes[0]]
+    common = [k for k in ours if theirs[best][k] is not None and sizes[k] == sizes[0]]
     errors = ["–", "–"]
     if board.kind != "aprilgrid" and len(common) > 3:
         size, fisheye = sizes[0][::-1], name == "fisheye"

@@ -1,12 +1,21 @@
 """Calibration from rendered photos of boards beside the truth: every trial draws poses, blur and noise of its own.
 
-    python -m scripts.bench_calib_rendered [--count 200] [--cases pinhole opencv4 fisheye fisheye190] [--json FILE]
+    python -m scripts.bench_calib_rendered [--count 200] [--first 0] [--cases pinhole opencv4 …] [--json FILE]
 
 Photos are 640 x 480; boards are rendered by rays through a grid of 3 x 3 in each pixel, blurred by 0.5 to 1.1 px and
 given noise of 1 to 2 % of full scale, then 8 bits. A ChArUco board may be cut by the image; a bent one is higher in its
 middle column by 0.5 mm, along an arc over its length. What is reported: corners found, their error; how many parameters
 are within three of their standard deviations of the truth; predicted over true deviations, by corners and by views; the
 bend that was found over the true one.
+
+The ratio of predicted deviations to errors of N trials is known to 1/√(2 N) only. Errors of parameters are sums over
+the views, though, each of which is drawn on its own,
+
+    dθ = Σ_v c_v,      c_v = Σ (Σ_i D_iᵀ e_i)
+
+with the true errors e_i of a view's corners and their derivatives D_i as in `calib.uncertainty_corners`; so E dθ² is
+E Σ_v c_v² as well, known four times as well with 15 views. Corners of a view may be correlated as they like: nothing
+but that views are independent is assumed. `linear` is the correlation of the sums with the errors that were found.
 """
 
 from __future__ import annotations
@@ -26,9 +35,10 @@ import numpy as np
 from calib.boards import Board, charuco, chessboard
 from calib.boards_artwork import artwork
 from calib.detect import Detection, detect_board
-from calib.refine import CalibrationConfig, calibrate
+from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_views import BoardView
 from calib.uncertainty import covariance
+from calib.uncertainty_corners import corner_derivatives
 from datasets.synthetic.boards import PARTS, SURROUND, texture
 from sfm.core.cameras import Camera
 from sfm.core.errors import Rejected
@@ -78,6 +88,7 @@ CASES = {
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=200)
+    parser.add_argument("--first", type=int, default=0, help="number of the first trial; each draws by its number")
     parser.add_argument("--cases", nargs="*", default=list(CASES), choices=list(CASES))
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", type=Path)
@@ -85,7 +96,7 @@ def main() -> int:
     rows = []
     for name in options.cases:
         with ProcessPoolExecutor(options.processes) as pool:
-            made = list(pool.map(partial(trial, name), range(options.count)))
+            made = list(pool.map(partial(trial, name), range(options.first, options.first + options.count)))
         rows.append({"case": name, **judged(CASES[name], made)})
         print(json.dumps(rows[-1]), flush=True)
     if options.json:
@@ -96,8 +107,11 @@ def main() -> int:
 def trial(name: str, number: int) -> dict[str, Any]:
     """One calibration: errors of the parameters and their predicted deviations, the bend, what was seen."""
     cv2.setNumThreads(1)
-    case = CASES[name]
-    views, errors, wanted = photographed(name, number)
+    return calibrated(CASES[name], *photographed(name, number))
+
+
+def calibrated(case: Case, views: list[BoardView], errors: list[np.ndarray], wanted: int) -> dict[str, Any]:
+    """What comes of a trial's views."""
     found = calibrate(
         case.board.points3D, views, CalibrationConfig(lens=case.lens, shape="paraboloid" if case.bend else "flat")
     )
@@ -105,13 +119,36 @@ def trial(name: str, number: int) -> dict[str, Any]:
     out["corner_px"] = float(np.sqrt(np.mean(np.square(np.concatenate(errors))))) if errors else None
     if isinstance(found, Rejected):
         return {**out, "failed": f"{found.reason} {found.detail}"}
-    sigmas = [given and list(given.deviations.values())[: len(case.camera.params)] for given in (
-        covariance(found), covariance(found, by_view=True))]  # fmt: skip
+    count = len(case.camera.params)
+    given = covariance(found), covariance(found, by_view=True)
+    sigmas = [None if isinstance(one, Rejected) else list(one.deviations.values())[:count] for one in given]
     return {
         **out, "error": (found.camera.params - case.camera.params).tolist(), "sigma": sigmas[0] or None,
-        "sigma_by_view": sigmas[1] or None, "bend": float(found.shape.coefficients[1]) if case.bend else None,
+        "sigma_by_view": sigmas[1] or None, "parts": parts_of_views(found, views, errors)[:, :count].tolist(),
+        "bend": float(found.shape.coefficients[1]) if case.bend else None,
         "rms": found.rms_px, "rejected": len(found.rejected_corners),
     }  # fmt: skip
+
+
+def parts_of_views(found: Calibration, views: list[BoardView], errors: list[np.ndarray]) -> np.ndarray:
+    """(V, K) of the error of what views share: what the errors (n, 2) of each view's corners have made of it."""
+    seen, shape, true_errors = found.observations, found.shape, {}
+    for view, off in zip(views, errors, strict=True):
+        true_errors[view.name] = dict(zip(view.corner_ids.tolist(), off, strict=True))
+    S, scores = 0.0, []
+    for v, name in enumerate(seen.names):
+        part = slice(seen.offsets[v], seen.offsets[v + 1])
+        rows = seen.rows[part]
+        by = corner_derivatives(
+            found.camera, found.columns, found.cams_from_board[v], seen.board[rows] + shape.displacements[rows],
+            shape.basis[rows], seen.roots[part], np.stack([true_errors[name][int(row)] for row in rows]),
+        )  # fmt: skip
+        J = np.concatenate([by.by_params, by.by_shape], 2).reshape(2 * len(rows), -1)
+        P = by.by_pose.reshape(2 * len(rows), 6)
+        D = J - P @ np.linalg.lstsq(P, J, rcond=None)[0]
+        S = S + D.T @ D
+        scores.append(D.T @ by.residuals.ravel())
+    return np.linalg.solve(S, np.array(scores).T).T
 
 
 def photographed(name: str, number: int) -> tuple[list[BoardView], list[np.ndarray], int]:
@@ -144,12 +181,23 @@ def judged(case: Case, made: list[dict[str, Any]]) -> dict[str, Any]:
         sigma = np.array([one[key] for one in good])
         row[f"within_3_{key}"] = float(np.mean(np.abs(errors / sigma) < 3))
         ratio = np.sqrt(np.mean(sigma**2, 0) / np.mean(errors**2, 0))
-        row[f"{key}_over_true"] = [float(f"{r:.3f}") for r in ratio]
-    row["bias_over_true"] = [float(f"{r:.3f}") for r in np.mean(errors, 0) / np.sqrt(np.mean(errors**2, 0))]
+        row[f"{key}_over_true"] = rounded(ratio)
+    parts = [np.array(one["parts"]) for one in good]
+    squares = np.array([np.sum(part**2, 0) for part in parts]) / np.array([one["sigma"] for one in good]) ** 2
+    row["sigma_over_parts"] = rounded(1 / np.sqrt(squares.mean(0)))
+    row["known_to"] = rounded(0.5 * squares.std(0) / squares.mean(0) / np.sqrt(len(good)))
+    sums = np.array([part.sum(0) for part in parts])
+    row["linear"] = float(min(np.corrcoef(sums[:, k], errors[:, k])[0, 1] for k in range(errors.shape[1])))
+    row["bias_over_true"] = rounded(np.mean(errors, 0) / np.sqrt(np.mean(errors**2, 0)))
     if case.bend:
         bends = np.array([one["bend"] for one in good]) / case.bend
-        row["bend_found"] = [float(f"{np.quantile(bends, q):.3f}") for q in (0.005, 0.05, 0.5, 0.95, 0.995)]
+        row["bend_found"] = rounded(np.quantile(bends, [0.005, 0.05, 0.5, 0.95, 0.995]))
     return row
+
+
+def rounded(numbers: np.ndarray) -> list[float]:
+    """For the table."""
+    return [float(f"{number:.3f}") for number in numbers]
 
 
 # --- photos -------------------------------------------------------------------------------------------------------
@@ -226,15 +274,16 @@ def rendered(
     part = np.s_[low[1] * PARTS : high[1] * PARTS, low[0] * PARTS : high[0] * PARTS]
     directions, inverse = rays.rays[part] @ pose.rotation.matrix, pose.inverse()
     center = inverse.translation
-    level = np.zeros(directions.shape[:2])
-    for _ in range(3 if case.bend else 1):
-        depth = (level - center[2]) / directions[..., 2]
-        hits = center[:2] + depth[..., None] * directions[..., :2]
-        level = height(case, hits[..., 0])
+    depth = -center[2] / directions[..., 2]
+    for _ in range(2 if case.bend else 0):
+        across = center[0] + depth * directions[..., 0]
+        depth = (height(case, across) - center[2]) / directions[..., 2]
+    hits = center[:2] + depth[..., None] * directions[..., :2]
     place = (hits + drawn.corners[0]) * TEXELS_PER_M - 0.5
     place[~(rays.seen[part] & (depth > 0) & np.isfinite(depth))] = -1e6
+    columns, rows = cv2.split(np.clip(place, -1e6, 1e6).astype(np.float32))
     fine = cv2.remap(
-        paint, np.clip(place, -1e6, 1e6).astype(np.float32), None, cv2.INTER_LINEAR,
+        paint, columns, rows, cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT, borderValue=SURROUND,
     )  # fmt: skip
     fine = cv2.GaussianBlur(fine, (0, 0), blur_px * PARTS)

@@ -264,7 +264,7 @@ def set_cameras(database: Path, truth: Reconstruction) -> None:
             camera = store.read_camera(image.camera_id)
             true_camera = truth.cameras[true_id]
             camera.model = getattr(pycolmap.CameraModelId, true_camera.model)
-            camera.params = true_camera.params
+            camera.params = true_camera.params.tolist()
             camera.has_prior_focal_length = True
             store.update_camera(camera)
 

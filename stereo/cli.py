@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from sfm.core.errors import ExitCode
+from sfm.io.console import guarded
 from stereo import __version__
 
 HELP = """\
@@ -23,7 +24,12 @@ Meanwhile:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the command line and returns its exit code."""
-    match list(sys.argv[1:] if arguments is None else arguments):
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    return guarded(lambda: _answer(words), "stereo", words)
+
+
+def _answer(words: list[str]) -> int:
+    match words:
         case ["-h" | "--help" | "help"]:
             print(HELP)
             return ExitCode.OK

@@ -15,6 +15,7 @@ import numpy as np
 
 from calib.boards import Board
 from calib.cli.calibrating import CalibratedCamera, CameraPlan, calibrate_camera
+from calib.cli.check_limits import board_of_record
 from calib.cli.parsing import board_of
 from calib.cli.refusals import no_camera
 from calib.cli.sightings import Sightings, see_board
@@ -44,7 +45,8 @@ def calibrated_again(
         SfmError: the file cannot be read or names no board, or the photos give no camera.
     """
     camera, record = read_camera_file(path)
-    seen = see_board(sources, _board(path, record, board), threads=threads, observer=observer)
+    size = (camera.width, camera.height)
+    seen = see_board(sources, _board(path, record, board), size=size, threads=threads, observer=observer)
     made = calibrate_camera(seen, _plan(camera, record), observer=observer) if seen.views else Rejected("no_board")
     if isinstance(made, Rejected):
         raise no_camera(seen, made, sources)
@@ -56,11 +58,13 @@ def calibrated_again(
     return (dataclasses.replace(made, would_bring=(str(told),)) if told else made), seen
 
 
-def _board(path: Path, record: CameraRecord, board: str) -> Board:
-    spec = board or (record.board.spec if record.board is not None else "")
-    if not spec:
+def _board(path: Path, record: CameraRecord, board: str) -> Board | None:
+    """None where the corners' files say by themselves where they lie."""
+    if board:
+        return board_of(board)
+    if record.board is None or not record.board.spec:
         raise ConfigError("names no board", path=path, remedy="name it with --board")
-    return board_of(spec)
+    return board_of_record(path, record)
 
 
 def _plan(camera: Camera, record: CameraRecord) -> CameraPlan:

@@ -17,7 +17,7 @@ import numpy as np
 
 from calib.board_turns import board_turns
 from calib.cli.sightings import Sightings
-from calib.cli.tried import with_what_was_tried
+from calib.cli.tried import with_what_was_measured, with_what_was_tried
 from calib.diagnose import Finding, diagnose
 from calib.diagnose_window import window_finding
 from calib.refine import Calibration, CalibrationConfig, RejectedView, calibrate
@@ -25,18 +25,11 @@ from calib.refine_board import ShapeKind
 from calib.refine_views import gather
 from calib.turned_photos import turned_photos
 from calib.uncertainty import CalibrationCovariance, covariance
-from calib.uncertainty_holdout import (
-    HeldOut,
-    RankedLens,
-    SplitHalf,
-    choose_lens,
-    fit_poses,
-    hold_out,
-    split_half,
-    views_of,
-)
+from calib.uncertainty_holdout import HeldOut, SplitHalf, fit_poses, hold_out, split_half, views_of
+from calib.uncertainty_lenses import RankedLens, choose_lens
 from calib.uncertainty_shapes import RankedShape, choose_shape
-from sfm.core.arrays import Value
+from calib.yardstick import Yardstick, measure_lens
+from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import Rejected
 from sfm.core.events import SILENT, Observer, StageFinished, StageStarted
 
@@ -85,6 +78,7 @@ class CalibratedCamera(Value):
         left_out: photos and views without a part in it, from detection on.
         findings: the gravest first.
         would_bring: what a richer lens and board shape would bring that were not taken, and need; a sentence each.
+        yardstick: the lens beside a splined one; None where it was given rather than chosen.
     """
 
     found: Calibration
@@ -99,6 +93,7 @@ class CalibratedCamera(Value):
     findings: tuple[Finding, ...]
     flat_px: float = math.nan
     would_bring: tuple[str, ...] = ()
+    yardstick: Yardstick | Rejected | None = None
 
     @property
     def doubts(self) -> CalibrationCovariance | Rejected:
@@ -140,8 +135,7 @@ def calibrate_camera(
         held_out = hold_out(seen.points3D, found, config, folds=plan.folds, rng=np.random.default_rng(plan.seed))
     halves = split_half(seen.points3D, found, config, rng=np.random.default_rng(plan.seed))
     plain, by_view = covariance(found), covariance(found, by_view=True)
-    observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
-    return CalibratedCamera(
+    made = CalibratedCamera(
         found=found,
         config=config,
         lenses=lenses,
@@ -157,6 +151,21 @@ def calibrate_camera(
         flat_px=_held_out_flat(seen, found, config, shapes, held_out, plan),
         would_bring=(*would_bring(lenses), *would_bring(shapes)),
     )
+    made = with_yardstick(made, seen.points3D, plan) if plan.lens == AUTO else made
+    observer(StageFinished(stage=STAGE, summary=f"rms {found.rms_px:.4f} px"))
+    return made
+
+
+def with_yardstick(made: CalibratedCamera, board: Points3D, plan: CameraPlan = CameraPlan()) -> CalibratedCamera:
+    """The same, with its lens beside a splined one, and what follows for the findings."""
+    held_out_px = math.inf if isinstance(made.held_out, Rejected) else made.held_out.rms_px
+    rng = np.random.default_rng(plan.seed)
+    measured = measure_lens(board, made.found, made.config, held_out_px, folds=plan.folds, rng=rng)
+    if isinstance(measured, Rejected):
+        return dataclasses.replace(made, yardstick=measured)
+    return dataclasses.replace(
+        made, yardstick=measured, findings=with_what_was_measured(made.findings, measured)
+    )  # fmt: skip
 
 
 def _held_out_flat(

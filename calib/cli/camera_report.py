@@ -15,10 +15,12 @@ from calib import __version__
 from calib.cli.calibrating import CalibratedCamera, would_bring
 from calib.cli.sightings import Sightings
 from calib.cli.suggestions_text import suggestion_lines, suggestions_json
+from calib.cli.yardstick_text import yardstick_json, yardstick_lines
 from calib.next_views import SuggestedView
 from calib.refine import Calibration
 from calib.uncertainty import CalibrationCovariance, rms_uncertainty, uncertainty_map
-from calib.uncertainty_holdout import HeldOut, RankedLens, SplitHalf
+from calib.uncertainty_holdout import HeldOut, SplitHalf
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import RankedShape
 from sfm.core.errors import Rejected
 from sfm.io.camera_records import BoardRecord, CameraRecord, Fact, ParameterCovariance
@@ -88,6 +90,7 @@ def camera_json(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Sug
         "lenses": [_row(row, row.lens) for row in made.lenses],
         "shapes": [_row(row, row.kind) for row in made.shapes],
         "would_bring": list(made.would_bring),
+        "yardstick": yardstick_json(made.yardstick),
         seen.kind: {"count": seen.count, "digest": seen.digest},
         "views": _views(found),
         "turned_views": list(found.turned_views),
@@ -113,6 +116,7 @@ def camera_lines(made: CalibratedCamera, seen: Sightings, suggested: Sequence[Su
         yield "  lens model    held-out  training  differs by px"
         yield from (_lens_line(row) for row in made.lenses)
         yield from (f"  {sentence}" for sentence in would_bring(made.lenses))
+    yield from yardstick_lines(made.yardstick)
     if made.left_out or found.rejected_corners:
         yield from ("", "left out", *_left_out_lines(made))
     if made.findings:

@@ -16,7 +16,7 @@ import numpy as np
 from calib.boards import Board
 from calib.boards_text import parse_board
 from calib.check import known_shape
-from calib.cli.sightings import Sightings
+from calib.cli.sightings import UNNAMED, Sightings
 from calib.refine_board import BoardShape
 from sfm.core.arrays import Points3D
 from sfm.core.errors import ConfigError, FormatError
@@ -38,13 +38,13 @@ class Limit:
 
 
 def board_of_record(path: Path, record: CameraRecord) -> Board | None:
-    """The board of a camera file, if it names one.
+    """The board of a camera file, if it names one; corners of other programs may have places of their own.
 
     Raises:
         ConfigError: what it names is none.
         FormatError: it has displacements for another number of corners.
     """
-    if record.board is None:
+    if record.board is None or UNNAMED.fullmatch(record.board.spec):
         return None
     try:
         board = parse_board(record.board.spec)
@@ -60,8 +60,13 @@ def board_of_record(path: Path, record: CameraRecord) -> Board | None:
 def shapes_to_try(record: CameraRecord, known: Board | None, seen: Sightings) -> list[BoardShape]:
     """Where the corners may lie, by the shape that they were found to have; none where it is of another board.
 
-    Two for a board with columns and rows swapped: the file does not tell which way it was turned.
+    Two for a board with columns and rows swapped: the file does not tell which way it was turned. Of a board without a
+    name the file does not tell whether it is the one with this shape: it may be flat as well.
     """
+    if record.board is not None and UNNAMED.fullmatch(record.board.spec) and seen.board is None:
+        if len(seen.points3D) != len(record.board.displacements):
+            return []
+        return [known_shape(seen.points3D + moved) for moved in (record.board.displacements, 0.0)]
     if record.board is None or known is None or seen.board is None or not len(record.board.displacements):
         return []
     if seen.board.spec == known.spec:

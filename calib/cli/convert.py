@@ -16,7 +16,9 @@ from sfm.core.errors import ConfigError, ExitCode, FormatError, Rejected
 if TYPE_CHECKING:
     from sfm.core.cameras import Camera
     from sfm.io.camera_exchange import Reread
+    from sfm.io.camera_records import CameraRecord
     from sfm.io.camera_set import CameraSet
+    from sfm.io.rig_files import RigFile
 
 EXAMPLES = (
     "calib convert camera.toml -o camera_info.yaml --to ros",
@@ -61,18 +63,22 @@ class ConvertOptions:
 def main(words: Sequence[str]) -> int:
     """Runs the command."""
     options = parsed(ConvertOptions, "convert", words, EXAMPLES)
-    from sfm.io.camera_exchange import format_of, read_camera_set, write_camera_set, write_poses_beside
+    from sfm.io.atomic import check_writable
+    from sfm.io.camera_exchange import format_of, read_camera_set, read_history, write_camera_set, write_poses_beside
 
     name = format_of(options.output, options.to)
+    check_writable(options.output)
     if options.output.exists() and options.source.exists() and options.output.samefile(options.source):
         raise ConfigError("is both source and target", path=options.output, remedy="choose another -o")
     source, cameras = read_camera_set(options.source, _size(options.size))
+    history, is_kept = read_history(options.source), name == "parallax" and not options.fit
     if options.camera:
+        is_kept &= cameras.cams_from_rig is None
         cameras = _chosen(cameras, options.camera)
     print(f"{options.source} ({source}): {_told(cameras)}")
     if options.fit:
         cameras = _fitted(cameras, options.fit)
-    found = write_camera_set(options.output, cameras, name)
+    found = write_camera_set(options.output, cameras, name, history if is_kept else None)
     print(f"{options.output} ({name}), read again:")
     print("\n".join(_lines(found)))
     beside = write_poses_beside(options.output, cameras, name)
@@ -83,6 +89,8 @@ def main(words: Sequence[str]) -> int:
         print(f"note: {old} was there before and is not of these cameras; COLMAP would read both")
     for remark in _lost(cameras, name, beside):
         print(remark)
+    if not is_kept and (tables := ", ".join(_tables(history))):
+        print(f"note: {tables} of {options.source} {'are' if ',' in tables else 'is'} not in it")
     return ExitCode.OK
 
 
@@ -144,6 +152,20 @@ def _lines(found: Sequence[Reread]) -> Iterator[str]:
     for one in found:
         pose = f", pose {one.motion:.1e}" if one.motion else ""
         yield f"  {one.name}: largest difference {one.apart.largest_px:.1e} px over the image{pose}"
+
+
+def _tables(history: CameraRecord | RigFile | None) -> Iterator[str]:
+    """What tells how cameras were calibrated, as the files of Parallax call it."""
+    from sfm.io.camera_records import CameraRecord
+    from sfm.io.rig_files import RigFile
+
+    told: dict[str, object] = {}
+    if isinstance(history, CameraRecord):
+        told = {"[calibration]": history.facts, "[uncertainty]": history.uncertainty, "[board]": history.board}
+        told |= {"[[finding]]": history.findings}
+    elif isinstance(history, RigFile):
+        told = {"[rig.provenance]": history.provenance, "standard deviations": history.sigmas}
+    yield from (name for name, what in told.items() if what)
 
 
 def _lost(cameras: CameraSet, name: str, beside: Sequence[Path]) -> Iterator[str]:

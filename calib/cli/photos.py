@@ -1,7 +1,8 @@
 """Detections of a board in files, on several threads; those of files seen before come from a cache.
 
-A detection is kept under a digest of the file's content, the board, the settings and the source of the detector. So a
-renamed or copied photo is known, and nothing is served that another version found.
+A detection is kept under a digest of the file's content, the board, the settings, the versions of this package and of
+OpenCV, and the sources that look at the photo, from reading it on. So a renamed or copied photo is known, and nothing
+is served that another version found.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import cv2
 import numpy as np
 
 import calib
+import sfm
 from calib.boards import Board
 from calib.detect import Detection, detect_board
 from calib.detect_gates import DetectConfig
@@ -31,7 +33,8 @@ from sfm.io.images import list_images, read_image
 from sfm.io.kernel_cache import user_cache_folder
 
 STAGE = "detection"
-_SOURCES = ("boards.py", "detect*.py", "_detect_kernels.py")
+_OWN_SOURCES = ("boards.py", "boards_artwork.py", "detect*.py", "_detect_kernels.py")
+_SHARED_SOURCES = ("core/imaging/noise.py", "core/imaging/resample.py", "io/images.py")
 
 
 def find_photos(sources: Sequence[Path]) -> dict[str, Path]:
@@ -180,16 +183,23 @@ def _key(path: Path, board: Board, config: DetectConfig) -> str:
         digest.update(path.read_bytes())
     except OSError as error:
         raise ImageError((error.strerror or str(error)).lower(), path=path) from error
-    digest.update("\n".join([board.spec, repr(config), cv2.__version__, _version_of_detector()]).encode())
+    versions = [calib.__version__, cv2.__version__, _version_of_detector()]
+    digest.update("\n".join([board.spec, repr(config), *versions]).encode())
     return digest.hexdigest()
+
+
+def detector_sources() -> list[Path]:
+    """The files of this package on which a detection depends, but for those that only say what an array or error is."""
+    folders = {Path(calib.__file__).parent: _OWN_SOURCES, Path(sfm.__file__).parent: _SHARED_SOURCES}
+    return [
+        path for folder, patterns in folders.items() for pattern in patterns for path in sorted(folder.glob(pattern))
+    ]
 
 
 @functools.cache
 def _version_of_detector() -> str:
     """A digest of all sources on which a detection depends."""
-    folder = Path(calib.__file__).parent
     digest = hashlib.blake2b(digest_size=16)
-    for pattern in _SOURCES:
-        for path in sorted(folder.glob(pattern)):
-            digest.update(path.read_bytes())
+    for path in detector_sources():
+        digest.update(path.read_bytes())
     return digest.hexdigest()

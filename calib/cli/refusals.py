@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from calib.board_extent import size_that_is_shown
@@ -13,11 +13,13 @@ from calib.cli.other_boards import board_that_is_shown
 from calib.cli.photos import find_photos, photos_of
 from calib.cli.sightings import Sightings
 from calib.diagnose import Finding
+from calib.refine_views import BoardView
+from sfm.core.arrays import ImageU8
 from sfm.core.errors import InputError, ReconstructionError, Rejected, SfmError
 
 _NAMED = 3
-_LOOKED_AT = 8
-"""Photos in which the board's size is made sure of."""
+_LOOKED_AT, _FEWEST_LOOKED_AT = 8, 3
+"""Photos in which the board's size is made sure of, and of each of several cameras."""
 COUNTED = {
     "chessboard": "inner corners", "charuco": "squares", "aprilgrid": "tags", "circles": "circles",
     "acircles": "circles",
@@ -59,28 +61,43 @@ def no_board(seen: Sightings, sources: Sequence[Path]) -> SfmError:
 
 
 def shown_size(seen: Sightings, sources: Sequence[Path]) -> Finding | None:
-    """What is to be said if the photos show a chessboard of another size than the one that was found in them.
+    """What is to be said if the photos show a board of another size than the one that was found in them.
 
     Raises:
         InputError: that is certain.
     """
-    if seen.board is None or seen.board.kind != "chessboard" or seen.kind != "photos":
+    return shown_size_of_all({"": seen}, {"": sources})
+
+
+def shown_size_of_all(seen: Mapping[str, Sightings], sources: Mapping[str, Sequence[Path]]) -> Finding | None:
+    """The same of several cameras, which see the same board.
+
+    Raises:
+        InputError: that is certain.
+    """
+    board = next((one.board for one in seen.values()), None)
+    if board is None or board.has_markers or any(one.kind != "photos" for one in seen.values()):
         return None
-    some = seen.views[:: max(1, -(-len(seen.views) // _LOOKED_AT))]
-    photos, views = photos_of(sources, [view.name for view in some], gray=True), {view.name: view for view in some}
-    shown = size_that_is_shown(seen.board, [(photo, views[name]) for name, photo in photos.items()])
+    each = max(_FEWEST_LOOKED_AT, _LOOKED_AT // len(seen))
+    looked_at = [pair for name, one in seen.items() for pair in _some_photos(one, sources[name], each)]
+    shown = size_that_is_shown(board, looked_at)
     if shown is None:
         return None
-    named = f"{seen.board.columns}x{seen.board.rows}"
-    told = (
-        f"{shown.count} of {shown.total} photos show a board of {shown.columns}x{shown.rows} inner corners, not {named}"
-    )
-    other = dataclasses.replace(seen.board, columns=shown.columns, rows=shown.rows)
+    counted, named = COUNTED[board.kind], f"{board.columns}x{board.rows}"
+    told = f"{shown.count} of {shown.total} photos show a board of {shown.columns}x{shown.rows} {counted}, not {named}"
+    other = dataclasses.replace(board, columns=shown.columns, rows=shown.rows)
     if shown.is_certain:
-        raise InputError(told, path=sources[0] if len(sources) == 1 else None, remedy=f"try --board {other.spec}")
+        folders = [path for paths in sources.values() for path in paths]
+        raise InputError(told, path=folders[0] if len(folders) == 1 else None, remedy=f"try --board {other.spec}")
     return Finding(
         "other_board", told, f"look at the corners with `calib detect --overlays`, or try --board {other.spec}"
     )
+
+
+def _some_photos(seen: Sightings, sources: Sequence[Path], count: int) -> list[tuple[ImageU8, BoardView]]:
+    some = seen.views[:: max(1, -(-len(seen.views) // count))]
+    photos = photos_of(sources, [view.name for view in some], gray=True)
+    return [(photos[view.name], view) for view in some if view.name in photos]
 
 
 def no_check(seen: Sightings, why: Rejected, sources: Sequence[Path]) -> SfmError:

@@ -75,15 +75,17 @@ def main(words: Sequence[str]) -> int:
 
 def _page_of_camera(options: ReportOptions) -> str:
     from calib.cli.again import calibrated_again
+    from calib.cli.calibrating import with_yardstick
     from calib.cli.photos import photos_of
     from calib.cli.progress import kernels_announced, told
     from calib.cli.report_page import report_page, worst_views
 
     observer = told()
     with kernels_announced(observer):
-        made, _ = calibrated_again(
+        made, seen = calibrated_again(
             options.camera, options.images, options.board, threads=options.threads, observer=observer
         )
+        made = with_yardstick(made, seen.points3D)
     photos = photos_of(options.images, worst_views(made.found))
     return report_page(options.camera.stem, made, photos=photos, distance=options.range)
 

@@ -10,10 +10,22 @@ import numpy as np
 from calib import __version__
 from calib import report_figures as figures
 from calib.cli.calibrating import CalibratedCamera
-from calib.cli.report_html import LONGER, finding_box, html_page, in_px, photo_with_residuals, side_by_side, table
+from calib.cli.report_html import (
+    LONGER,
+    finding_box,
+    html_page,
+    in_px,
+    photo_with_residuals,
+    sentence,
+    side_by_side,
+    table,
+)
+from calib.cli.yardstick_text import yardstick_words
 from calib.diagnose import Finding
 from calib.refine import Calibration
 from calib.uncertainty import rms_uncertainty
+from calib.yardstick import Yardstick
+from calib.yardstick_figure import lens_difference_figure
 from sfm.core.arrays import ImageU8
 from sfm.core.errors import Rejected
 
@@ -45,6 +57,7 @@ def report_page(
         "<h2>What the model does not explain</h2>",
         side_by_side([figures.residual_field_figure(found), figures.residual_scatter_figure(found)]),
         side_by_side([figures.views_figure(found), figures.board_figure(found.shape)]),
+        *_yardstick(result),
         *_worst(found, photos or {}),
         *_left_out(result),
         f'<p class="quiet">Parallax calib {__version__}. Pixels: the centre of the first is at (½, ½).</p>',
@@ -140,6 +153,15 @@ def _uncertainty(result: CalibratedCamera, distance: float | None) -> str:
         figures.uncertainty_figure(found, given),
         figures.uncertainty_figure(found, given, near, f"{near:.3g} m away"),
     ])  # fmt: skip
+
+
+def _yardstick(result: CalibratedCamera) -> Iterator[str]:
+    measured = result.yardstick
+    if isinstance(measured, Yardstick):
+        yield f"<h2>Whether that is the lens or the board</h2><p>Judged by {escape(yardstick_words(measured))}.</p>"
+        rows = [["lens", sentence(measured.of_lens)], ["board", sentence(measured.of_board)]]
+        yield table([], [row for row in rows if row[1] != "."], words=True)
+        yield side_by_side([lens_difference_figure(result.found.camera, measured)])
 
 
 def _worst(found: Calibration, photos: Mapping[str, ImageU8]) -> Iterator[str]:

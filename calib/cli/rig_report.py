@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections import Counter
@@ -13,6 +14,7 @@ import numpy as np
 from calib import __version__
 from calib.boards import Board
 from calib.cli.sightings import Sightings
+from calib.diagnose import Finding
 from calib.rig_epipolar import EpipolarErrors, epipolar_errors
 from calib.rig_frames import FrameTable
 from calib.rig_result import RigCalibration
@@ -81,7 +83,7 @@ def _found(ranked: RankedRig) -> RigCalibration:
 
 
 def rig_json(
-    ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table: FrameTable
+    ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table: FrameTable, finding: Finding | None = None
 ) -> dict[str, Any]:  # fmt: skip
     """Everything that is known of a rig."""
     chosen, found = ranked[0], _found(ranked[0])
@@ -105,6 +107,7 @@ def rig_json(
         "cameras": [_camera_json(found, c, covariances, seen[name]) for c, name in enumerate(found.names)],
         "pairs": [_pair_json(found, i, j, covariances) for i, j in itertools.combinations(range(len(found.names)), 2)],
         "fallbacks": list(found.fallbacks),
+        "findings": [] if finding is None else [dataclasses.asdict(finding)],
     }
 
 
@@ -168,8 +171,10 @@ def _pair_json(
 # --- for a person -------------------------------------------------------------------------------------------------
 
 
-def rig_lines(ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table: FrameTable) -> Iterator[str]:
-    """The report on the screen."""
+def rig_lines(
+    ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table: FrameTable, finding: Finding | None = None
+) -> Iterator[str]:
+    """The report on the screen, with what else was found to be wrong."""
     chosen, found = ranked[0], _found(ranked[0])
     covariances, by_frame = rig_covariance(found), rig_covariance(found, by_frame=True)
     yield from _frame_lines(found, table)
@@ -182,6 +187,8 @@ def rig_lines(ranked: Sequence[RankedRig], seen: Mapping[str, Sightings], table:
     yield f"rms {found.rms_px:.4f} px{held}; board {found.shape.kind}{_bend(found)}; {_converged(found)}"
     yield from _shape_lines(ranked)
     yield from _left_out_lines(found, seen)
+    if finding is not None:
+        yield f"note: {finding.detail}; {finding.remedy}"
     yield from (f"note: {words}" for words in (*found.fallbacks, *rig_remarks(found)))
 
 

@@ -33,12 +33,14 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
 
     from calib.board_turns import board_turns
     from calib.cli.progress import kernels_announced, told
+    from calib.cli.refusals import shown_size_of_all
     from calib.cli.rig_report import rig_json, rig_lines, rig_record
     from sfm.io.rig_files import write_rig_file
 
     observer = told()
     with kernels_announced(observer):
         seen, table = see_rig(files, board, pair=options.pair, threads=options.threads, cached=not options.no_cache)
+        finding = shown_size_of_all(seen, files)
         cameras = rig_cameras(seen, files, table, options)
         ranked = _calibrated(board, cameras, board_turns(board), options)
     if isinstance(ranked, Rejected):
@@ -47,9 +49,9 @@ def run(options: CommonOptions, sources: Mapping[str, str], command: str) -> int
     if options.json:
         import json
 
-        print(json.dumps(rig_json(ranked, seen, table), indent=2, ensure_ascii=False))
+        print(json.dumps(rig_json(ranked, seen, table, finding), indent=2, ensure_ascii=False))
     else:
-        print("\n".join([*rig_lines(ranked, seen, table), "", str(options.output)]))
+        print("\n".join([*rig_lines(ranked, seen, table, finding), "", str(options.output)]))
     return ExitCode.OK
 
 
@@ -127,7 +129,7 @@ def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]]
     from calib.cli.refusals import no_camera
     from calib.refine_fit import CalibrationConfig
     from calib.refine_lenses import Lens, lens_by_name
-    from calib.uncertainty_holdout import choose_lens
+    from calib.uncertainty_lenses import choose_lens
 
     found: dict[str, Lens] = {}
     for name, one in seen.items():

@@ -76,16 +76,40 @@ def poses_of_photos(
 ) -> tuple[list[BoardView], Rigid3, tuple[RejectedView, ...]]:
     """Views with a pose, these poses (V,), and the views without one.
 
-    A photo's name in the table may lack folder and suffix.
+    A photo's name in the table may lack folder and suffix, or have others.
 
     Raises:
-        FormatError: no photo has a pose.
+        FormatError: no photo has a pose, or without folder and suffix several rows or several photos are called alike.
     """
-    by_stem = {PurePath(name).stem: pose for name, pose in table.items()}
-    found = [(view, table.get(view.name) or by_stem.get(PurePath(view.name).stem)) for view in views]
+    names = _rows_of([view.name for view in views], list(table), path)
+    found = [(view, table[name] if name else None) for view, name in zip(views, names, strict=True)]
     kept = [(view, pose) for view, pose in found if pose is not None]
     if not kept:
-        names = f"{next(iter(table))} in the table, {views[0].name} among the photos"
-        raise FormatError(f"names no photo that shows the board: {names}", path=path)
+        told = f"{next(iter(table))} in the table, {views[0].name} among the photos"
+        raise FormatError(f"names no photo that shows the board: {told}", path=path)
     alone = tuple(RejectedView(view.name, "no_pose", "the table has none") for view, pose in found if pose is None)
     return [view for view, _ in kept], Rigid3.stack([pose for _, pose in kept]), alone
+
+
+def _rows_of(photos: Sequence[str], rows: Sequence[str], path: Path) -> list[str]:
+    """The name in the table of each photo, empty where there is none; what names a photo in full is no other's."""
+    known = set(rows)
+    named = {photo: photo for photo in photos if photo in known}
+    free = dict.fromkeys(row for row in rows if row not in named)
+    stems: dict[str, list[str]] = {}
+    for row in free:
+        stems.setdefault(PurePath(row).stem, []).append(row)
+    owner: dict[str, str] = {}
+    for photo in photos:
+        whole = str(PurePath(photo).with_suffix(""))
+        alike = [whole] if whole in free else stems.get(PurePath(photo).stem, [])
+        if photo in named or not alike:
+            continue
+        if len(alike) > 1:
+            told = f"{photo} may be {alike[0]} or {alike[1]} in the table"
+            raise FormatError(told, path=path, remedy="name each photo there with its folder and suffix")
+        if alike[0] in owner:
+            told = f"{alike[0]} in the table may be the photo {owner[alike[0]]} or {photo}"
+            raise FormatError(told, path=path, remedy="name each photo there with its folder and suffix")
+        owner[alike[0]], named[photo] = photo, alike[0]
+    return [named.get(photo, "") for photo in photos]

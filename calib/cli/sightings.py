@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -24,6 +25,8 @@ from sfm.core.events import SILENT, Observer
 from sfm.io.images import list_images
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".pgm", ".ppm", ".heic", ".jp2")
+UNNAMED = re.compile(r"a board of \d+ points")
+"""What files call a board whose corners have places, and which has no other name."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

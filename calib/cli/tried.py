@@ -7,8 +7,9 @@ import math
 from collections.abc import Sequence
 
 from calib.diagnose import Finding
-from calib.uncertainty_holdout import RankedLens
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import CANDIDATES, RankedShape
+from calib.yardstick import Yardstick
 
 
 def with_what_was_tried(
@@ -22,6 +23,21 @@ def with_what_was_tried(
     remedies = {"bent_board": _of_board(shapes), "lens_model": _of_lens(lenses)}
     return tuple(
         dataclasses.replace(finding, remedy=remedy) if (remedy := remedies.get(finding.cause)) else finding
+        for finding in findings
+    )
+
+
+def with_what_was_measured(findings: Sequence[Finding], measured: Yardstick) -> tuple[Finding, ...]:
+    """The findings; what is the same wherever in the image it is seen may be the board, which a splined lens tells."""
+    remedy = (
+        "compare richer lens models with --shape free: the board hides what they bring"
+        if measured.is_lens and measured.shape == "free"
+        else "try a richer lens model"
+        if measured.is_lens
+        else "look for what shifts corners (a bend, blur, glare): a splined lens predicts photos held out no better"
+    )
+    return tuple(
+        dataclasses.replace(finding, remedy=remedy) if finding.cause == "lens_model" else finding
         for finding in findings
     )
 

@@ -88,10 +88,10 @@ def main(words: Sequence[str]) -> int:
     from sfm.io.camera_files import write_camera_toml
     from sfm.io.image_encoding import encoded_image
 
+    check_writable(options.output / "camera.toml")
     camera, photos = _camera(options.camera), find_photos(options.images)
     if any(path.resolve() == (options.output / name).resolve() for name, path in photos.items()):
         raise ConfigError("would write over the photos", path=options.output, remedy="choose another -o")
-    check_writable(options.output / "camera.toml")
     target = _target(camera, options)
     map_x, map_y = undistortion_grid(camera, target)
     valid = (map_x >= 0) & (map_x <= camera.width) & (map_y >= 0) & (map_y <= camera.height)

@@ -48,9 +48,11 @@ def main(words: Sequence[str]) -> int:
     if options.text and options.binary:
         raise ConfigError("--text and --binary exclude each other")
     from sfm.cli.compare import model_folder
-    from sfm.io.convert import convert
+    from sfm.io.atomic import check_writable
+    from sfm.io.convert import convert, is_point_cloud
 
-    source = options.source if options.source.suffix.lower() == ".ply" else model_folder(options.source)
+    check_writable(options.target if is_point_cloud(options.target) else options.target / "cameras.bin")
+    source = options.source if is_point_cloud(options.source) else model_folder(options.source)
     text = options.text if options.text or options.binary else None
     kind = convert(source, options.target, text=text, overwrite=options.overwrite)
     names = {"ply": "a PLY point cloud", "txt": "a COLMAP text model", "bin": "a COLMAP binary model"}

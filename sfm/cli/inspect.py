@@ -66,7 +66,7 @@ def _lines(found: Inspection) -> Iterator[str]:
             f"   {exposure.white:4.0%}   {_focal(image):<11}  {_remarks(found, image)}"
         ).rstrip()
     for name, reason in found.unreadable.items():
-        yield f"{name}: {reason}"
+        yield f"{name if name.isprintable() else ascii(name)}: {reason}"
     for group in found.copies:
         yield f"the same file: {', '.join(group)}"
     for group in found.near_copies:

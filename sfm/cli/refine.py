@@ -178,7 +178,7 @@ def main(words: Sequence[str]) -> int:
     from sfm.cli.refine_tables import write_tables
     from sfm.core.execution import available_threads
     from sfm.core.optim.losses import LOSSES
-    from sfm.io.atomic import write_text
+    from sfm.io.atomic import check_writable, write_text
     from sfm.io.colmap_model import read_model, write_model
     from sfm.pipeline.refinement import RefinementConfig, refine_model
     from sfm.viz.convergence import convergence_svg
@@ -187,6 +187,7 @@ def main(words: Sequence[str]) -> int:
         raise ConfigError(f"unknown loss {options.loss!r}", remedy=f"choose one of {', '.join(LOSSES)}")
     source = model_folder(options.model)
     target = _target(options, source)
+    check_writable(target / "cameras.bin", options.plot)
     try:
         bundle = BundleConfig(
             loss=options.loss,

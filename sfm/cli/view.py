@@ -45,10 +45,12 @@ def main(words: Sequence[str]) -> int:
     if options.save and options.web:
         raise ConfigError("--save and --web exclude each other")
     from sfm.core.arrays import ImageU8
+    from sfm.io.atomic import check_writable
     from sfm.io.colmap_model import read_model
     from sfm.io.images import read_image
     from sfm.viz.rerun_log import log_reconstruction
 
+    check_writable(options.save)
     model = read_model(model_folder(options.workspace))
     folder = options.images or images_folder(options.workspace)
 

@@ -19,6 +19,8 @@ from sfm.core.errors import InputError
 
 Chunks: TypeAlias = Iterable[Any]
 """Pieces of a file, each `bytes` or a contiguous array: what `file.write` takes."""
+_PROBED = 4096
+"""Bytes, one block of most disks."""
 
 
 @contextlib.contextmanager
@@ -27,11 +29,12 @@ def os_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(_cause(error), path=path, remedy=_remedy(error)) from error
+        raise refusal(error, path) from error
 
 
-def _cause(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
+def refusal(error: OSError, path: Path | str | None) -> InputError:
+    """What the system refuses, with what can be done about it."""
+    return InputError((error.strerror or str(error)).lower(), path=path, remedy=_remedy(error))
 
 
 def _remedy(error: OSError) -> str:
@@ -42,6 +45,15 @@ def _remedy(error: OSError) -> str:
             return "check the spelling of the path"
         case FileExistsError() | NotADirectoryError() | IsADirectoryError():
             return "choose another path, or move what lies there"
+    match error.errno:
+        case errno.ENAMETOOLONG:
+            return "choose a shorter name"
+        case errno.EFBIG:
+            return "the system limits the size of files, see `ulimit -f`"
+        case errno.EMFILE | errno.ENFILE:
+            return "close other programs, or raise the limit of open files, see `ulimit -n`"
+        case errno.ENOSPC:
+            return "make room there, or choose another disk or folder"
     return "choose another disk or folder"
 
 
@@ -58,12 +70,16 @@ def check_writable(*targets: Path | None) -> None:
             if target.is_dir():
                 raise IsADirectoryError(errno.EISDIR, "is a folder")
             folder = next(parent for parent in Path(os.path.abspath(target)).parents if parent.exists())
-            probe = folder / f".{secrets.token_hex(4)}.tmp"
+            probe = _beside(folder / target.name)
             try:
-                probe.touch(exist_ok=False)
+                probe.write_bytes(bytes(_PROBED))  # a full disk takes the name of a file, but not a byte
             finally:
                 with contextlib.suppress(OSError):
                     probe.unlink()
+
+
+def _beside(target: Path) -> Path:
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
 
 
 @contextlib.contextmanager
@@ -75,7 +91,7 @@ def atomic_path(target: Path, *, sync: bool = False) -> Iterator[Path]:
     Raises:
         InputError: the system refuses, e.g. in a read-only folder.
     """
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    temporary = _beside(target)
     with os_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         try:

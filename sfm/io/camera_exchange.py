@@ -17,16 +17,17 @@ from sfm.core.geometry.rigid import Rigid3
 from sfm.core.scene import CameraRig
 from sfm.io import colmap_binary, colmap_text
 from sfm.io.atomic import atomic_path, write_chunks, write_text
-from sfm.io.camera_files import read_intrinsics, write_camera_toml
+from sfm.io.camera_files import read_camera_file, read_intrinsics, write_camera_toml
 from sfm.io.camera_foreign import FOREIGN_SUFFIXES, foreign_format, read_foreign_cameras
 from sfm.io.camera_kalibr import kalibr_text
 from sfm.io.camera_nerfstudio import nerfstudio_text
 from sfm.io.camera_opencv import opencv_text
+from sfm.io.camera_records import CameraRecord
 from sfm.io.camera_ros import ros_text
 from sfm.io.camera_set import CameraSet
 from sfm.io.camera_tables import toml_document
 from sfm.io.colmap_rigs import has_place_for_poses, read_rig_beside, write_rig_beside
-from sfm.io.rig_files import RigFile, read_rig_file, write_rig_file
+from sfm.io.rig_files import RigFile, is_rig_file, read_rig_file, write_rig_file
 
 _BY_SUFFIX = {".toml": "parallax", ".txt": "colmap", ".bin": "colmap", ".json": "nerfstudio"}
 _TEXTS: dict[str, Callable[[CameraSet], str]] = {
@@ -100,9 +101,27 @@ def format_of(path: Path | str, named: str = "") -> str:
     return name
 
 
-def write_camera_set(path: Path | str, cameras: CameraSet, name: str) -> tuple[Reread, ...]:
+def read_history(path: Path | str) -> CameraRecord | RigFile | None:
+    """What a `.toml` tells of how its cameras were calibrated: of a camera a record, of a rig the whole file.
+
+    None for files of other programs.
+
+    Raises:
+        SfmError: as `read_camera_set`.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".toml":
+        return None
+    return read_rig_file(path) if is_rig_file(path) else read_camera_file(path)[1]
+
+
+def write_camera_set(
+    path: Path | str, cameras: CameraSet, name: str, history: CameraRecord | RigFile | None = None
+) -> tuple[Reread, ...]:
     """Writes cameras in a format, and reads them again before the file takes its place.
 
+    Args:
+        history: of these very cameras, for the files of Parallax; see `read_history`.
     Raises:
         InputError: the system refuses.
         FormatError: the format has no place for these cameras, or what is read again is not what was written.
@@ -113,7 +132,7 @@ def write_camera_set(path: Path | str, cameras: CameraSet, name: str) -> tuple[R
             # The reader goes by the suffix.
             staged = temporary.with_suffix(path.suffix)
             try:
-                _write(staged, cameras, name)
+                _write(staged, cameras, name, history)
                 found = _compared(cameras, read_camera_set(staged)[1])
             finally:
                 if staged.exists():
@@ -137,14 +156,16 @@ def write_poses_beside(path: Path | str, cameras: CameraSet, name: str) -> tuple
     return write_rig_beside(path, cameras)
 
 
-def _write(path: Path, cameras: CameraSet, name: str) -> None:
+def _write(path: Path, cameras: CameraSet, name: str, history: CameraRecord | RigFile | None) -> None:
     if name in _TEXTS:
         write_text(path, _TEXTS[name](cameras))
     elif name == "colmap":
         writer = colmap_binary if path.suffix.lower() == ".bin" else colmap_text
         write_chunks(path, writer.cameras_chunks(dict(enumerate(cameras.cameras, 1))))
+    elif isinstance(history, RigFile):
+        write_rig_file(path, history)
     elif len(cameras) == 1:
-        write_camera_toml(path, cameras.cameras[0], name=cameras.names[0])
+        write_camera_toml(path, cameras.cameras[0], name=cameras.names[0], record=history or CameraRecord())
     elif cameras.cams_from_rig is None:
         raise FormatError(
             f"a .toml has one camera or a rig, and these {len(cameras)} cameras have no poses",

@@ -23,11 +23,11 @@ def convert(source: Path | str, target: Path | str, *, text: bool | None = None,
         FormatError: a file of `source` is damaged.
     """
     source, target = Path(source), Path(target)
-    if source.suffix.lower() == ".ply":
+    if is_point_cloud(source):
         raise InputError("a point cloud has no cameras to convert", path=source, remedy="name the folder of a model")
     if os.path.realpath(source) == os.path.realpath(target):
         raise InputError("is both source and target", path=target, remedy="name another folder as the target")
-    to_ply = target.suffix.lower() == ".ply"
+    to_ply = is_point_cloud(target)
     taken = target.exists() if to_ply else model_format(target) is not None
     if taken and not overwrite:
         raise InputError("is there already", path=target, remedy="choose another target, or --overwrite it")
@@ -38,3 +38,8 @@ def convert(source: Path | str, target: Path | str, *, text: bool | None = None,
     as_text = model_format(source) == "bin" if text is None else text
     write_model(reconstruction, target, text=as_text)
     return "txt" if as_text else "bin"
+
+
+def is_point_cloud(path: Path) -> bool:
+    """Whether a path names a PLY file."""
+    return path.suffix.lower() == ".ply"

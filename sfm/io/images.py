@@ -280,6 +280,8 @@ def _decode(data: bytes, path: Path, colour: int) -> np.ndarray:
 
 
 def _first_line(error: Exception) -> str:
+    if "CV_IO_MAX_IMAGE" in str(error):  # its own words are those of a programmer
+        return "it has more than 2³⁰ pixels or 2²⁰ in a row or column"
     return (str(error).strip().splitlines() or ["out of memory"])[0]
 
 

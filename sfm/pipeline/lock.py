@@ -42,12 +42,12 @@ def _claim(path: Path) -> bool:
     """Creates the file with its content in one step, which fails where one exists."""
     own = {"pid": os.getpid(), "host": socket.gethostname(), "started": _start_of(os.getpid())}
     draft = path.with_name(f"{_NAME}.{secrets.token_hex(4)}.tmp")
-    draft.write_text(json.dumps(own))
     try:
+        draft.write_text(json.dumps(own))
         os.link(draft, path)
     except FileExistsError:
         return False
-    except OSError:  # a file system without hard links
+    except OSError:  # a file system without hard links; one that takes no file at all says so again
         try:
             with path.open("x") as file:
                 file.write(json.dumps(own))

@@ -18,7 +18,7 @@ import cv2
 from sfm.core.errors import ConfigError, InputError, SfmError
 from sfm.core.events import Event, Observer, StageFinished, StageStarted
 from sfm.core.execution import available_threads
-from sfm.io.atomic import os_errors, write_text
+from sfm.io.atomic import check_writable, os_errors, write_text
 from sfm.io.database import Database
 from sfm.pipeline.config import PipelineConfig, to_toml
 from sfm.pipeline.lock import locked
@@ -132,6 +132,7 @@ def _check(images_folder: Path, workspace: Path, remedy: str) -> None:
             remedy=f"choose another, e.g. -o {images_folder.resolve()}-sfm",
         )
     with os_errors(workspace):
+        check_writable(workspace / "sfm.toml")
         workspace.mkdir(parents=True, exist_ok=True)
 
 

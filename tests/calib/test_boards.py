@@ -66,6 +66,30 @@ def test_a_file_that_is_no_board_is_an_error_of_configuration(text):
         parse_board_toml(text)
 
 
+@pytest.mark.parametrize(
+    ("word", "cause", "remedy"),
+    [
+        ("charuco:8x6:30mm:22mm:DICT_5X5_10", "unknown set of markers 'DICT_5X5_10'", "DICT_5X5_100"),
+        ("charuco:8x6:30mm:22mm:FOO", "unknown set of markers 'DICT_FOO'", "DICT_4X4_100"),
+        ("charuco:12x10:30mm:22mm:DICT_4X4_50", "has 60 markers, DICT_4X4_50 has 50",
+         "DICT_4X4_100 or DICT_4X4_1000 or DICT_4X4_250 would do"),
+        ("aprilgrid:7x6:30mm:9mm:DICT_APRILTAG_16h5", "has 42 markers, DICT_APRILTAG_16h5 has 30",
+         "DICT_APRILTAG_36h10 or DICT_APRILTAG_36h11 would do"),
+        ("charuco:80x60:30mm:22mm", "more than any set", "fewer columns and rows"),
+    ],
+)  # fmt: skip
+def test_markers_that_there_are_not_are_told_with_those_that_would_do(word, cause, remedy):
+    with pytest.raises(ConfigError) as error:
+        parse_board(word)
+    assert cause in error.value.cause
+    assert remedy in error.value.remedy
+
+
+def test_the_last_marker_of_a_set_may_be_used():
+    assert parse_board("charuco:10x10:30mm:22mm:DICT_4X4_50").dictionary == "DICT_4X4_50"
+    assert parse_board("aprilgrid:6x5:30mm:9mm:DICT_APRILTAG_16H5").dictionary == "DICT_APRILTAG_16H5"
+
+
 def test_lengths_need_a_unit():
     assert [parse_length(text) for text in ("25mm", "2.5 cm", ".025m", "1in")] == [0.025, 0.025, 0.025, 0.0254]
     with pytest.raises(ConfigError, match="unit"):

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from calib.boards import chessboard
-from calib.cli.calibrating import CalibratedCamera, CameraPlan, calibrate_camera
+from calib.cli.calibrating import CalibratedCamera, CameraPlan, calibrate_camera, with_yardstick
 from calib.cli.camera_report import camera_json, camera_lines, record_of
 from calib.cli.next_photos import further_photos, next_photos
 from calib.cli.sightings import Sightings
 from calib.uncertainty import rms_uncertainty
+from calib.yardstick import Yardstick
 from sfm.core.errors import Rejected
 from tests.calib.boards_in_space import LENS, poses_before, seen, with_corners
 
@@ -106,3 +107,20 @@ def test_the_error_with_a_flat_board_is_told_for_a_shape_that_was_given(rng):
     made = made_of(shown, shape="paraboloid")
     assert not isinstance(made.held_out, Rejected)
     assert made.flat_px > 1.5 * made.held_out.rms_px
+
+
+def test_the_yardstick_is_told_where_the_lens_was_chosen_and_only_there(rng):
+    shown = sightings(10, rng)
+    given = made_of(shown)
+    assert given.yardstick is None
+    assert camera_json(given, shown, ())["yardstick"] is None
+    assert "splined" not in "\n".join(camera_lines(given, shown, ()))
+    chosen = with_yardstick(given, shown.points3D)
+    assert isinstance(chosen.yardstick, Yardstick)
+    text = "\n".join(camera_lines(chosen, shown, ()))
+    assert f"  lens    {chosen.yardstick.of_lens}" in text
+    told = camera_json(chosen, shown, ())["yardstick"]
+    assert told["is_lens"] is chosen.yardstick.is_lens
+    assert told["splined_holdout_rms_px"] == chosen.yardstick.splined_rms_px
+    refused = dataclasses.replace(given, yardstick=Rejected("too_few_views", "2 of 3"))
+    assert "no splined lens as a yardstick: too_few_views: 2 of 3" in "\n".join(camera_lines(refused, shown, ()))

@@ -15,7 +15,8 @@ from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_ends import Quadratics, most_likely_turns
 from calib.refine_turns import read_alike
 from calib.refine_views import BoardView
-from calib.uncertainty_holdout import HeldOut, choose_lens, hold_out
+from calib.uncertainty_holdout import HeldOut, hold_out
+from calib.uncertainty_lenses import choose_lens
 from tests.calib.boards_in_space import LENS, poses_before, seen
 
 EVEN, SQUARE = chessboard(8, 6, 0.03), circle_grid(7, 7, 0.03)

@@ -96,6 +96,30 @@ def test_figures_are_well_formed_and_within_their_size(found, name):
         assert 0 <= float(dot.get("cy")) <= height
 
 
+def test_arrows_of_the_residual_field_end_within_the_image(found):
+    drawing = figures.residual_field_figure(found)
+    (field, *_) = parts(drawing, "rect")
+    left, top, width, height = (float(field.get(name)) for name in ("x", "y", "width", "height"))
+    for line in parts(drawing, "line"):
+        assert left - 0.1 <= float(line.get("x2")) <= left + width + 0.1
+        assert top - 0.1 <= float(line.get("y2")) <= top + height + 0.1
+
+
+@pytest.mark.parametrize("count", [1, 40, 60, 90, 200])
+def test_a_title_ends_before_the_legend_in_a_wide_font(count):
+    drawing = svg.figure(svg.Frame(0.0, 1.0, 0.0, 1.0), "n" * count, [], legend="<g/>")
+    (title,) = parts(drawing, "text")
+    size, fitted = float(title.get("font-size")), title.get("textLength")
+    assert 11 <= size <= 14
+    assert (float(fitted) if fitted else 0.6 * size * count) <= svg.WIDTH + 1
+
+
+def test_a_bar_of_colours_says_that_there_is_more():
+    frame = svg.Frame(0.0, 1.0, 0.0, 1.0)
+    assert ">≥ 2<" in svg.color_legend(frame, 0.0, 2.0, "px", most=2.1)
+    assert "≥" not in svg.color_legend(frame, 0.0, 2.0, "px", most=2.0)
+
+
 @given(st.floats(-1e6, 1e6), st.floats(1e-6, 1e6))
 def test_round_numbers_lie_between_their_ends_in_even_steps(low, span):
     numbers = svg.round_numbers(low, low + span)

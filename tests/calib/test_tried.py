@@ -6,11 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from calib.cli.tried import with_what_was_tried
+from calib.cli.tried import with_what_was_measured, with_what_was_tried
 from calib.diagnose import Finding
 from calib.refine import CalibrationConfig
-from calib.uncertainty_holdout import RankedLens
+from calib.uncertainty_lenses import RankedLens
 from calib.uncertainty_shapes import RankedShape, choose_shape
+from calib.yardstick import Yardstick
 from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen
 
 BENT = Finding("bent_board", "50 %", "let the board's shape be estimated (free), or glue it to glass")
@@ -55,3 +56,16 @@ def test_a_shape_that_predicts_worse_is_not_said_to_have_been_refused(rng):
     assert chosen.kind == "free"
     assert [row.refused for row in others] == ["", ""]
     assert all(row.held_out_rms_px > chosen.held_out_rms_px for row in others)
+
+
+def test_what_a_splined_lens_says_decides_whether_a_richer_lens_is_a_remedy():
+    apart = np.full((2, 2), 0.1)
+    measured = Yardstick("radial", "free", 0.2, 0.1, 160, True, apart, (1.0, 1.0), 0.3, 0.1)
+    told, other = with_what_was_measured([LENS_FINDING, OTHER], measured)
+    assert other == OTHER
+    assert "richer lens models with --shape free" in told.remedy
+    assert (
+        "richer" not in with_what_was_measured([LENS_FINDING], dataclasses.replace(measured, is_lens=False))[0].remedy
+    )
+    on_flat = dataclasses.replace(measured, shape="flat")
+    assert "--shape free" not in with_what_was_measured([LENS_FINDING], on_flat)[0].remedy

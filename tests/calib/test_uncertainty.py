@@ -187,8 +187,7 @@ def dense_jacobian(found):
     return J, residuals(np.zeros(len(steps)))
 
 
-def test_rejection_is_made_up_for(rng):
-    """Heavy tails, cut off: what is left looks more certain than it is."""
+def test_deviations_hold_where_errors_have_heavy_tails_and_the_worst_are_rejected(rng):
     exact, errors, variances = seen(LENS, BOARD, poses_before(LENS, 8, rng), rng, 0.0), [], []
     for _ in range(80):
         noisy = [with_corners(v, v.points2D + 0.05 * rng.standard_t(3, v.points2D.shape)) for v in exact]
@@ -197,6 +196,19 @@ def test_rejection_is_made_up_for(rng):
         variances.append(np.diag(covered(found).shared))
     ratio = np.sqrt(np.mean(variances, axis=0) / np.mean(np.square(errors), axis=0))
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_corner_that_is_rejected_leaves_deviations_as_they_were_in_photos_of_unlike_sharpness(rng):
+    exact = seen(LENS, BOARD, poses_before(LENS, 12, rng), rng, 0.0)
+    noisy = [with_corners(v, v.points2D + (0.3 if k < 4 else 0.1) * rng.normal(size=v.points2D.shape))
+             for k, v in enumerate(exact)]  # fmt: skip
+    off = noisy[7].points2D.copy()
+    off[5] += [6.0, 5.0]
+    config = dataclasses.replace(CONFIG, reject=True)
+    found = calibrated([*noisy[:7], with_corners(noisy[7], off), *noisy[8:]], config)
+    assert len(found.rejected_corners) == 1
+    without, as_it_was = covered(found).deviations, covered(calibrated(noisy, config)).deviations
+    np.testing.assert_allclose(list(without.values()), list(as_it_was.values()), rtol=0.04)
 
 
 def test_leaving_out_views_agrees_where_views_are_alike_and_many():

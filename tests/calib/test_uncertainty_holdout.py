@@ -9,7 +9,8 @@ import pytest
 
 from calib.refine import CalibrationConfig, calibrate
 from calib.refine_views import gather
-from calib.uncertainty_holdout import choose_lens, hold_out, pose_only_errors, split_half, views_of
+from calib.uncertainty_holdout import hold_out, pose_only_errors, split_half, views_of
+from calib.uncertainty_lenses import choose_lens
 from sfm.core.errors import Rejected
 from tests.calib.boards_in_space import LENS, PINHOLE, flat_board, poses_before, seen, with_corners
 
