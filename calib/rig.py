@@ -24,6 +24,7 @@ from calib.rig_poses import CameraFrames, FirstPoses, first_poses
 from calib.rig_reject import RigFit, reject_from_rig
 from calib.rig_result import RigCalibration, RigConfig
 from calib.rig_system import RigSystem
+from calib.rig_turns import read_frames_alike, turned_frames
 from calib.rig_views import RigCamera, RigObservations
 from sfm.core.arrays import Points3D
 from sfm.core.errors import Rejected
@@ -61,7 +62,8 @@ def calibrate_rig(
         return copied
     alone = []
     for one in cameras:
-        found = camera_alone(board, one, config.alone(one.lens), config.refine_known)
+        by_itself = dataclasses.replace(config.alone(one.lens), turns=tuple(turns))
+        found = camera_alone(board, one, by_itself, config.refine_known)
         if isinstance(found, Rejected):
             return found
         alone.append(found)
@@ -74,6 +76,7 @@ def calibrate_rig(
     observations, estimate = _gathered(board, alone, frames, first, turns, config)
     if not config.refine_intrinsics and config.shape == "flat":
         observations, estimate = _shared_frames(observations, estimate)
+    observations, estimate = read_frames_alike(fit, observations, estimate, turns)
     system, summary = fit.solve(observations, estimate)
     views: list[list[RejectedView]] = [list(one.rejected) for one in alone]
     corners: list[list[tuple[str, int]]] = [
@@ -87,7 +90,7 @@ def calibrate_rig(
     apart = _unconnected(names, system.observations, config.min_frames, views)
     if apart is not None:
         return apart
-    return _result(names, alone, fit, system, summary, first, turns, frames, views, corners)
+    return _result(cameras, alone, fit, system, summary, first, views, corners)
 
 
 def _fit(config: RigConfig, alone: Sequence[AloneCamera]) -> RigFit:
@@ -186,10 +189,10 @@ def _unconnected(
 
 
 def _result(
-    names: tuple[str, ...], alone: Sequence[AloneCamera], fit: RigFit, system: RigSystem, summary: Summary,
-    first: FirstPoses, turns: Sequence[BoardTurn], frames: tuple[str, ...],
-    views: Sequence[Sequence[RejectedView]], corners: Sequence[Sequence[tuple[str, int]]],
+    given: Sequence[RigCamera], alone: Sequence[AloneCamera], fit: RigFit, system: RigSystem, summary: Summary,
+    first: FirstPoses, views: Sequence[Sequence[RejectedView]], corners: Sequence[Sequence[tuple[str, int]]],
 ) -> RigCalibration:  # fmt: skip
+    names = tuple(one.name for one in given)
     observations, residuals, estimate = system.observations, system.residuals(), system.estimate
     unknown = 6 * len(observations.frames) + system.shared_count
     freedom = 2 * observations.corner_count - unknown
@@ -208,7 +211,7 @@ def _result(
         observations=observations,
         residuals=tuple(residuals),
         alone=tuple(alone),
-        turned=tuple(tuple(frames[f] for f in np.flatnonzero(chosen)) for chosen in first.turns),
+        turned=tuple(turned_frames(one, observations, c) for c, one in enumerate(given)),
         rejected_views=tuple(tuple(one) for one in views),
         rejected_corners=tuple(tuple(one) for one in corners),
         rms_px=math.sqrt(total / observations.corner_count),

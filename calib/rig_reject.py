@@ -80,7 +80,7 @@ def reject_from_rig(
     Returns:
         `nothing_fits` where no two views of a frame are left.
     """
-    lengths, full = _lengths(system), system.observations
+    lengths, full = system.whitened_lengths(), system.observations
     sigma, limits = _limits(fit, full, lengths, fit.reject_beyond_sigma, None)
     if not any(np.any(one > limit) for one, limit in zip(lengths, limits, strict=True)):
         return system, summary
@@ -89,7 +89,7 @@ def reject_from_rig(
     minimize(judge, ROBUST)
     before: list[np.ndarray] | None = None
     for _ in range(_ROUNDS):
-        lengths = _lengths(judge)
+        lengths = judge.whitened_lengths()
         sigma, limits = _limits(fit, full, lengths, fit.keep_within_sigma, before)
         kept = [one <= limit for one, limit in zip(lengths, limits, strict=True)]
         good = []
@@ -131,13 +131,3 @@ def _limits(
         limits_of(lengths[c], seen, sigmas, sigma, among=None if among is None else among[c])
         for c, seen in enumerate(observations.cameras)
     ]
-
-
-def _lengths(system: RigSystem) -> list[FloatArray]:
-    """Of each camera (n,) lengths of the whitened residuals; inf where there is no projection."""
-    found = []
-    for r, camera in zip(system.residuals(), system.observations.cameras, strict=True):
-        a, b, c = camera.roots.T
-        lengths = np.hypot(a * r[:, 0] + b * r[:, 1], c * r[:, 1])
-        found.append(np.where(np.isfinite(lengths), lengths, np.inf))
-    return found

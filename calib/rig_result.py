@@ -94,7 +94,7 @@ class RigCalibration(Value):
         observations: of the views and corners that were used. Their weights contain those of the cameras.
         residuals: of each camera (n, 2) projected − observed, px.
         alone: each camera by itself.
-        turned: of each camera the frames in which it read the board from another side than the others.
+        turned: of each camera the frames in which it reads the board from another end than it was given with.
         rejected_views: by camera.
         rejected_corners: by camera, as (name of the view, row of the board's point).
         rms_px: root of the mean squared length of residuals over all corners.

@@ -130,6 +130,29 @@ class RigSystem:
         self._evaluate(self._now, out)
         return out
 
+    def whitened_lengths(self) -> list[Vector]:
+        """Of each camera (n,) lengths of the whitened residuals; inf where there is no projection."""
+        found = []
+        for r, camera in zip(self.residuals(), self.observations.cameras, strict=True):
+            a, b, c = camera.roots.T
+            lengths = np.hypot(a * r[:, 0] + b * r[:, 1], c * r[:, 1])
+            found.append(np.where(np.isfinite(lengths), lengths, np.inf))
+        return found
+
+    def by_frame(self) -> tuple[FloatArray, FloatArray]:
+        """What each frame adds to S (F, K, K) and to the gradient (F, K), with its pose eliminated."""
+        equations, count = self.normal_equations(), self.shared_count + 1
+        A = np.zeros((len(equations.H), count, count))
+        for c, (blocks, seen) in enumerate(zip(self._now.blocks, self.observations.frame_of, strict=True)):
+            mount, at = self._mounts[c], self._places[c]
+            places = np.concatenate([np.arange(mount.start, mount.stop), at])
+            # A mount moves its views as their own poses do.
+            first = 6 - (mount.stop - mount.start)
+            lower = np.tril(blocks[:, first:, first:])
+            A[np.ix_(seen, places, places)] += lower + np.tril(lower, -1).swapaxes(1, 2)
+        A -= equations.W.swapaxes(1, 2) @ np.linalg.solve(equations.H, equations.W)
+        return A[:, :-1, :-1], A[:, :-1, -1]
+
     def normal_equations(self) -> NormalEquations:
         """At the current parameters."""
         frames, count = len(self.observations.frames), self.shared_count + 1

@@ -22,7 +22,7 @@ from calib.rig_result import RigCalibration
 from calib.rig_system import RigSystem
 from calib.rig_views import RigObservations
 from calib.uncertainty_corners import corner_derivatives, corner_scores, jackknife
-from sfm.core.arrays import FloatArray, Value, Vector, readonly
+from sfm.core.arrays import FloatArray, Value, readonly
 from sfm.core.errors import Rejected
 from sfm.core.geometry.rigid import Rigid3
 from sfm.core.geometry.rotation import skew
@@ -89,9 +89,7 @@ def rig_covariance(found: RigCalibration, *, by_frame: bool = False, alike: bool
         return Rejected("undetermined_parameters", "the frames leave a combination of parameters open")
     variance = found.sigma_px**2
     if by_frame:
-        parts = [_part_of(found, system, f) for f in range(len(found.observations.frames))]
-        reduced, scores = np.stack([part for part, _ in parts]), np.stack([score for _, score in parts])
-        without = jackknife(reduced, scores, system.param_slices[-1].stop)
+        without = jackknife(*system.by_frame(), system.param_slices[-1].stop)
         if without is None:
             return Rejected("undetermined_parameters", "without one of the frames a combination of parameters is open")
         shared, left_open = without
@@ -162,16 +160,6 @@ def _by_corner(found: RigCalibration, system: RigSystem, sigma: FloatArray) -> F
             scores = corner_scores(by.by_pose @ mount.adjoint(), by_shared, by.residuals, inverses[f], W[f], sigma)
             meat += scores.T @ scores
     return sigma @ meat @ sigma
-
-
-def _part_of(found: RigCalibration, system: RigSystem, frame: int) -> tuple[FloatArray, Vector]:
-    """What one frame adds to S and to the gradient, with its pose eliminated."""
-    some, left = found.observations.of_frames([frame])
-    free_shape = len(found.shape.coefficients) > 0
-    alone = RigSystem(some, system.estimate.of_frames(left), found.columns, free_shape=free_shape).normal_equations()
-    H, W = alone.H[0], alone.W[0]
-    reduced = alone.A - W.T @ np.linalg.solve(H, W)
-    return reduced[:-1, :-1], reduced[:-1, -1]
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -23,8 +23,11 @@ from sfm.core.geometry.rotation import skew
 
 _SURE = 1e-6
 """Least pivot, over the diagonal, of a matrix that is not suspected of being singular."""
-_OPEN, _NO_PART = 1e-10, 1e-4
-"""Of what was known of a direction, below which nothing is; and of a unit vector, what is none of its entries."""
+_OPEN = 1e-10
+"""Part of what was known of a direction, below which nothing is."""
+_SMALL_PART, _NO_PART = 0.5, 1e-4
+"""Of a unit vector that is open: what may lie in what is needed (the mean size of the board is held, and so that of a
+rig hangs a little on the place of each point, by a tenth here), and what is nothing."""
 _LEAST_FREEDOM = 1e-3
 """Of a residual's direction, below which the fit has followed all of it."""
 
@@ -102,7 +105,7 @@ def jackknife(reduced: FloatArray, scores: FloatArray, needed: int) -> tuple[Flo
 
     Args:
         reduced: (V, K, K) what each adds to S, scores: (V, K) and to the gradient, with its pose eliminated.
-        needed: the first so many must not be open; None where they are.
+        needed: the first so many must not be open, but for a small part; None where they are.
     """
     S, steps, left_open = reduced.sum(0), [], np.zeros(scores.shape[1], bool)
     if not np.all(np.diag(S) > 0):
@@ -114,9 +117,9 @@ def jackknife(reduced: FloatArray, scores: FloatArray, needed: int) -> tuple[Flo
         step, ways = _solved(without, by), np.zeros((len(S), 0))
         if step is None:
             step, ways = _solved_but_open(scaled, without, by)
-        if np.abs(ways[:needed]).max(initial=0.0) > _NO_PART:
+        if ways.shape[1] and np.linalg.norm(ways[:needed], 2) > _SMALL_PART:
             return None
-        left_open |= np.abs(ways).max(1, initial=0.0) > _NO_PART
+        left_open[needed:] |= np.abs(ways[needed:]).max(1, initial=0.0) > _NO_PART
         steps.append(scale * step)
     apart = np.array(steps) - np.mean(steps, axis=0)
     return (len(steps) - 1) / len(steps) * apart.T @ apart, left_open
