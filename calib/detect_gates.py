@@ -153,5 +153,6 @@ def fitted_circles(
     kept = corners.kept
     if kept.sum() >= 4:
         corners.points2D = centroids.copy()
-        corners.points2D[kept] = without_shifts(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2)
+        size = grey.shape[1], grey.shape[0]
+        corners.points2D[kept] = without_shifts(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2, size)
     return corners
