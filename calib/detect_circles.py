@@ -58,6 +58,24 @@ def fit_circles(
     return centres, covariances
 
 
+def with_dark_circles(
+    grey: UInt8[np.ndarray, "H W"], points2D: Points2D, affines: Affines, board: Board
+) -> UInt8[np.ndarray, "H W"]:
+    """The photo, or its negative where circles are lighter than the blank around them."""
+    around = np.arange(8) * (np.pi / 4)
+    ring = (board.detail_m / 2 + board.clear_radius_m) / 2
+    blank = points2D[:, None] + np.einsum(
+        "nij,kj->nki", affines, ring * np.column_stack([np.cos(around), np.sin(around)])
+    )
+    most = np.array([grey.shape[1], grey.shape[0]]) - 1
+
+    def at(points: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis(np.clip(points.astype(int), 0, most), -1, 0)
+        return grey[y, x].astype(np.float64)
+
+    return 255 - grey if np.median(at(points2D) - np.median(at(blank), axis=1)) > 0 else grey
+
+
 def centroid_shifts(image: ImageOfBoard, board_points: Points2D, radius_m: float) -> Points2D:
     """Centroid of each disc's image less the image of its centre, in px.
 
