@@ -1,24 +1,30 @@
 """Centres of circles to a fraction of a pixel.
 
-The image of a circle is an ellipse whose centroid is found from its darkness, pixel by pixel. But the centroid of the
-ellipse is not the image of the circle's centre: perspective draws the near half larger. With C the circle as a dual
-conic and H the map from board to image, the ellipse is H C Hᵀ, and the last column of it is its centre; so the
-difference from the image of the circle's centre is known and taken off.
+The image of a circle is about an ellipse whose centroid is found from its darkness, pixel by pixel. But the centroid is
+not the image of the circle's centre: perspective draws the near half larger, and lenses bend what is left. With f the
+map from board to image, the centroid of the area inside f(rim) is known, and so is its difference from f(centre), which
+is taken off. Of f this needs the curvature: it is that of a lens with one coefficient (`detect_plane`) which fits all
+circles of the photo. What such a lens cannot say is redone where a camera is known; see `circle_shifts`.
 
 Reference:
-    Hartley & Zisserman, Multiple View Geometry, 2nd ed., result 2.14 (dual conics).
     Heikkilä, Geometric camera calibration using circular control points, PAMI 2000.
 """
 
 from __future__ import annotations
 
-import cv2
+from collections.abc import Callable
+from typing import TypeAlias
+
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from calib.boards import Board
 from calib.detect_neighbours import Affines
-from sfm.core.arrays import Matrix3, Points2D
+from calib.detect_plane import fit_plane_closely
+from sfm.core.arrays import Points2D
+
+ImageOfBoard: TypeAlias = Callable[[Points2D], Points2D]
+"""From (x, y) on the board in metres to px."""
 
 _ROUNDS = 4
 _DARK, _LIGHT = 0.25, 0.75
@@ -27,7 +33,9 @@ _ROUNDING_VARIANCE = 1 / 12
 _LEAST_CONTRAST = 12.0
 _SAMPLING_PX = 0.007
 """Deviation that remains without noise, since pixels sample the rim coarsely: measured with a blur of 0.5 px."""
-_NEIGHBOURS = 12
+_RIM_POINTS = 64
+_ROUNDS_OF_SHIFTS = 5
+"""A shift changes by a hundredth when the points are shifted by it, by a tenth where a fisheye is widest."""
 _MARGIN = 0.2
 """Of the blank up to the next circle, the part that belongs to the window; more may reach beyond the board's edge."""
 
@@ -50,55 +58,57 @@ def fit_circles(
     return centres, covariances
 
 
-def centre_shifts(board_points: Points2D, radius_m: float, image_from_board: Matrix3) -> Points2D:
-    """Centroid of each ellipse less the image of the circle's centre, in px."""
-    x, y = board_points.T
-    one = np.ones_like(x)
-    conics = np.array([[x * x - radius_m**2, x * y, x], [x * y, y * y - radius_m**2, y], [x, y, one]])
-    last_column = np.einsum("ij,jkn,k->in", image_from_board, conics, image_from_board[2])
-    centre = image_from_board @ np.stack([x, y, one])
-    return (last_column[:2] / last_column[2] - centre[:2] / centre[2]).T
+def with_dark_circles(
+    grey: UInt8[np.ndarray, "H W"], points2D: Points2D, affines: Affines, board: Board
+) -> UInt8[np.ndarray, "H W"]:
+    """The photo, or its negative where circles are lighter than the blank around them."""
+    around = np.arange(8) * (np.pi / 4)
+    ring = (board.detail_m / 2 + board.clear_radius_m) / 2
+    blank = points2D[:, None] + np.einsum(
+        "nij,kj->nki", affines, ring * np.column_stack([np.cos(around), np.sin(around)])
+    )
+    most = np.array([grey.shape[1], grey.shape[0]]) - 1
+
+    def at(points: np.ndarray) -> np.ndarray:
+        x, y = np.moveaxis(np.clip(points.astype(int), 0, most), -1, 0)
+        return grey[y, x].astype(np.float64)
+
+    return 255 - grey if np.median(at(points2D) - np.median(at(blank), axis=1)) > 0 else grey
 
 
-def without_shifts(points2D: Points2D, board_points: Points2D, radius_m: float) -> Points2D:
+def centroid_shifts(image: ImageOfBoard, board_points: Points2D, radius_m: float) -> Points2D:
+    """Centroid of each disc's image less the image of its centre, in px.
+
+    Discs are polygons of `_RIM_POINTS` corners with the discs' moments of inertia by their areas, so that centroids are
+    those of the discs up to the fourth order.
+    """
+    step = 2 * np.pi / _RIM_POINTS
+    around, reach_m = step * np.arange(_RIM_POINTS), radius_m * np.sqrt(3 / (2 + np.cos(step)))
+    rims = board_points[:, None] + reach_m * np.stack([np.cos(around), np.sin(around)], axis=1)
+    rims = image(rims.reshape(-1, 2)).reshape(*rims.shape) - image(board_points)[:, None]
+    after = np.roll(rims, -1, axis=1)
+    doubled_areas = rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
+    return ((rims + after) * doubled_areas[..., None]).sum(axis=1) / (3 * doubled_areas.sum(axis=1))[:, None]
+
+
+def without_shifts(points2D: Points2D, board_points: Points2D, radius_m: float, size: tuple[int, int]) -> Points2D:
     """Images of the circles' centres from centroids of their images.
 
-    Perspective is taken off by the homography that fits all circles; what the lens bends beyond it, by the difference
-    of the second-order shifts of what is seen and of the homography's own picture of it.
+    Args:
+        size: width and height of the image, px.
     """
     centres = points2D
-    for _ in range(2):
-        homography, _ = cv2.findHomography(board_points, centres)
-        if homography is None:
-            return points2D
-        flat = np.column_stack([board_points, np.ones(len(board_points))]) @ homography.T
-        bent = curvature_shifts(board_points, centres, radius_m)
-        bent -= curvature_shifts(board_points, flat[:, :2] / flat[:, 2:], radius_m)
-        centres = points2D - centre_shifts(board_points, radius_m, homography) - bent
+    for _ in range(_ROUNDS_OF_SHIFTS):
+        centres = points2D - shifts_by_one_lens(centres, board_points, radius_m, size)
     return centres
 
 
-def curvature_shifts(board_points: Points2D, points2D: Points2D, radius_m: float) -> Points2D:
-    """Centroid of the image of each disc less the image of its centre, to second order in the radius, for any lens.
-
-    With f the map from board to image and J its Jacobian, the centroid is  f + r²/8 ∇²f + r²/4 J ∇ log det J; the
-    derivatives are those of a quadratic function through the nearest neighbours. Zero where there are few.
-    """
-    if len(board_points) < _NEIGHBOURS:
-        return np.zeros_like(points2D)
-    offset = board_points[None] - board_points[:, None]
-    order = np.argsort(np.linalg.norm(offset, axis=2), axis=1, kind="stable")[:, :_NEIGHBOURS]
-    x, y = np.moveaxis(np.take_along_axis(offset, order[:, :, None], 1) / radius_m, 2, 0)
-    design = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=2)
-    _, fx, fy, fxx, fxy, fyy = np.moveaxis(np.linalg.pinv(design, rcond=1e-4) @ points2D[order], 1, 0)
-    determinant = _cross(fx, fy)
-    along_x = (_cross(fxx, fy) + _cross(fx, fxy)) / determinant
-    along_y = (_cross(fxy, fy) + _cross(fx, fyy)) / determinant
-    return (fxx + fyy) / 8 + (fx * along_x[:, None] + fy * along_y[:, None]) / 4
-
-
-def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+def shifts_by_one_lens(centres: Points2D, board_points: Points2D, radius_m: float, size: tuple[int, int]) -> Points2D:
+    """What `without_shifts` has taken off if these are the images of the centres that it gave; zero where unknown."""
+    if len(board_points) < 4:
+        return np.zeros_like(centres)
+    shifts = centroid_shifts(fit_plane_closely(board_points, centres, size).image, board_points, radius_m)
+    return np.where(np.isfinite(shifts), shifts, 0.0)
 
 
 def _centroid(

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from calib.boards import Board
-from calib.detect_circles import fit_circles, without_shifts
+from calib.detect_circles import fit_circles, with_dark_circles, without_shifts
 from calib.detect_crossings import Expectations, fit_crossings
 from calib.detect_neighbours import Affines
 from calib.detect_places import misplaced
@@ -147,6 +147,7 @@ def fitted_circles(
 ) -> Corners:
     """Centres of circles near `points2D`, with a verdict on each."""
     noise = 255 * noise_sigma(np.ascontiguousarray(grey))
+    grey = with_dark_circles(grey, points2D, affines, board)
     centroids, covariances = fit_circles(grey, points2D, affines, board, noise)
     nothing = np.full(len(ids), np.nan)
     corners = Corners(ids, points2D, centroids, covariances, np.full((len(ids), 11), np.nan), nothing)
@@ -157,5 +158,6 @@ def fitted_circles(
     kept = corners.kept
     if kept.sum() >= 4:
         corners.points2D = centroids.copy()
-        corners.points2D[kept] = without_shifts(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2)
+        size = grey.shape[1], grey.shape[0]
+        corners.points2D[kept] = without_shifts(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2, size)
     return corners

@@ -16,13 +16,19 @@ Reference:
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.optimize import minimize_scalar
 
 from sfm.core.arrays import Points2D, Value
 
 _COEFFICIENTS = (0.1, 0.0, -0.03, -0.1, -0.2, -0.35, -0.5, -0.75, -1.0, -1.4, -2.0, -3.0)
+_CLOSE = 1e-4
+_NONE = 1e12
+_LEAST_FOR_LENS = 9
+"""Fewer corners hardly tell a lens from perspective."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -57,20 +63,41 @@ def fit_plane(board_points: Points2D, points2D: Points2D, size: tuple[int, int])
         board_points: (x, y) on the board, at least four; row by row the partners of `points2D`.
         size: width and height of the image, px.
     """
+    planes = _planes(board_points, points2D, size)
+    return min((planes(coefficient) for coefficient in _COEFFICIENTS), key=_error_at(board_points, points2D))
+
+
+def fit_plane_closely(board_points: Points2D, points2D: Points2D, size: tuple[int, int]) -> LensedPlane:
+    """As `fit_plane`, with the best of all coefficients; without any where there are few points."""
+    planes, error = _planes(board_points, points2D, size), _error_at(board_points, points2D)
+    if len(board_points) < _LEAST_FOR_LENS:
+        return planes(0.0)
+    errors = [error(planes(coefficient)) for coefficient in _COEFFICIENTS]
+    at = int(np.argmin(errors))
+    between = _COEFFICIENTS[min(at + 1, len(errors) - 1)], _COEFFICIENTS[max(at - 1, 0)]
+    found = minimize_scalar(lambda x: error(planes(float(x))), bounds=between, options={"xatol": _CLOSE})
+    return planes(float(found.x))
+
+
+def _planes(board_points: Points2D, points2D: Points2D, size: tuple[int, int]) -> Callable[[float], LensedPlane]:
+    """The map that is nearest for each coefficient."""
     middle, unit = np.array(size) / 2, float(np.hypot(*size)) / 2
     center = board_points.mean(axis=0)
     reach = float(np.abs(board_points - center).max())
     scale = np.array([[1 / reach, 0, -center[0] / reach], [0, 1 / reach, -center[1] / reach], [0, 0, 1]])
     normed = np.column_stack([(board_points - center) / reach, np.ones(len(board_points))])
     offsets = (points2D - middle) / unit
-    best, least = LensedPlane(scale, 0.0, middle, unit), np.inf
-    for coefficient in _COEFFICIENTS:
-        homography = _homography(normed, offsets, coefficient) @ scale
-        plane = LensedPlane(homography, coefficient, middle, unit)
-        error = float(np.square(plane.image(board_points) - points2D).mean())
-        if error < least:
-            best, least = plane, error
-    return best
+    return lambda x: LensedPlane(_homography(normed, offsets, x) @ scale, x, middle, unit)
+
+
+def _error_at(board_points: Points2D, points2D: Points2D) -> Callable[[LensedPlane], float]:
+    """Mean squared distance, px²; beyond all measure where a point has no image."""
+
+    def error(plane: LensedPlane) -> float:
+        mean = float(np.square(plane.image(board_points) - points2D).mean())
+        return mean if np.isfinite(mean) else _NONE
+
+    return error
 
 
 def _homography(normed: Float64[np.ndarray, "N 3"], offsets: Points2D, coefficient: float) -> np.ndarray:

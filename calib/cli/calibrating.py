@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from calib.board_turns import board_turns
+from calib.circle_shifts import TRIED, with_exact_centres
 from calib.cli.sightings import Sightings
 from calib.cli.tried import with_what_was_measured, with_what_was_tried
 from calib.diagnose import Finding, diagnose
@@ -112,6 +113,9 @@ def calibrate_camera(
     observer(StageStarted(stage=STAGE))
     turns = board_turns(seen.board) if seen.board is not None else ()
     config = dataclasses.replace(plan.config, turns=turns)
+    lenses_of_centres = TRIED if plan.lens == AUTO else (plan.lens,)
+    views = with_exact_centres(seen.board, seen.views, config, lenses=lenses_of_centres)
+    seen = dataclasses.replace(seen, views=views)
     lenses: tuple[RankedLens, ...] = ()
     shapes: tuple[RankedShape, ...] = ()
     if plan.lens == AUTO:

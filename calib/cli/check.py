@@ -71,6 +71,7 @@ def main(words: Sequence[str]) -> int:
     options = parsed(CheckOptions, "check", words, EXAMPLES)
     _check_options(options)
 
+    from calib.circle_shifts import exact_centres
     from calib.cli.check_report import check_json, check_lines
     from calib.cli.next_photos import further_photos
     from calib.cli.progress import kernels_announced, told
@@ -90,6 +91,7 @@ def main(words: Sequence[str]) -> int:
         )  # fmt: skip
         finding = shown_size(seen, options.images)
         camera, sigmas = _at_size(original, record, seen)
+        seen = dataclasses.replace(seen, views=exact_centres(seen.board, seen.views, camera))
         checked, limit_from = _checked(options, record, known, seen, camera, sigmas, camera.width / original.width)
     if isinstance(checked, Rejected):
         raise no_check(seen, checked, options.images)

@@ -85,6 +85,7 @@ def main(words: Sequence[str]) -> int:
     board = board_of(options.board)
 
     from calib.board_turns import board_turns
+    from calib.circle_shifts import exact_centres
     from calib.cli.handeye_report import hand_eye_json, hand_eye_lines, hand_eye_toml
     from calib.cli.progress import kernels_announced, told
     from calib.cli.refusals import no_board
@@ -106,7 +107,8 @@ def main(words: Sequence[str]) -> int:
         )
         if not seen.views:
             raise no_board(seen, options.images)
-        views, poses, alone = poses_of_photos(seen.views, table, options.poses)
+        exact = exact_centres(board, seen.views, next(iter(cameras.values())))
+        views, poses, alone = poses_of_photos(exact, table, options.poses)
         config = HandEyeConfig(
             setup="eye_to_hand" if options.eye_to_hand else "eye_in_hand", robot_sigma=_robot_sigma(options)
         )

@@ -12,6 +12,7 @@ import numpy as np
 
 from calib.board_turns import board_turns
 from calib.boards import Board
+from calib.circle_shifts import exact_centres
 from calib.cli.again import SAME_PX, difference_px
 from calib.cli.parsing import board_of
 from calib.cli.rig_options import expanded, named_sources
@@ -107,7 +108,7 @@ def _camera(file: RigFile, c: int, seen: Mapping[str, Sightings], table: FrameTa
         lens = lens_called(lens).name if lens and not given else lens_of(camera)
     except ValueError as error:
         raise ConfigError(str(error), path=path) from error
-    views = seen[name].views
+    views = exact_centres(seen[name].board, seen[name].views, camera)
     frames = tuple(table.frames[name][view.name] for view in views)
     return RigCamera(name, views, frames, lens, camera if given else None)
 

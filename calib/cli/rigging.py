@@ -107,6 +107,7 @@ def rig_cameras(
     names = tuple(seen)
     lenses, known = lenses_of(options, names), known_cameras(options, names)
     lenses |= {name: lens_of(camera) for name, camera in known.items() if lenses[name] == AUTO}
+    seen = {name: _with_exact_centres(one, known.get(name), lenses[name]) for name, one in seen.items()}
     lenses |= _chosen({name: one for name, one in seen.items() if lenses[name] == AUTO}, files, options.seed)
     return [
         RigCamera(
@@ -118,6 +119,21 @@ def rig_cameras(
         )
         for name, one in seen.items()
     ]
+
+
+def _with_exact_centres(seen: Sightings, known: Camera | None, lens: str) -> Sightings:
+    """Sightings of circles with the shifts of their centroids as the camera that is known says, or its own photos."""
+    import dataclasses
+
+    from calib.circle_shifts import TRIED, exact_centres, with_exact_centres
+    from calib.refine_fit import CalibrationConfig
+
+    if known is not None:
+        return dataclasses.replace(seen, views=exact_centres(seen.board, seen.views, known))
+    lenses = TRIED if lens == AUTO else (lens,)
+    return dataclasses.replace(
+        seen, views=with_exact_centres(seen.board, seen.views, CalibrationConfig(), lenses=lenses)
+    )
 
 
 def _chosen(seen: Mapping[str, Sightings], files: Mapping[str, tuple[Path, ...]], seed: int) -> dict[str, str]:

@@ -6,7 +6,6 @@ import pytest
 
 from calib.boards import aprilgrid, asymmetric_circle_grid, charuco, chessboard, circle_grid
 from calib.detect import Detection, detect_board
-from calib.detect_circles import centre_shifts, curvature_shifts
 from calib.detect_gates import DetectConfig
 from calib.detect_neighbours import local_affines, predicted
 from calib.detect_overlay import overlay
@@ -138,36 +137,6 @@ def test_a_photo_without_a_board_is_rejected_by_name(board, rng):
     seen = detect_board(photo, board)
     assert isinstance(seen, Rejected)
     assert seen.reason in ("no_board", "too_few_corners")
-
-
-def test_the_centre_of_an_ellipse_is_off_by_the_formula(rng):
-    homography = np.array([[900.0, 80, 200], [-60, 850, 150], [0.8, 1.2, 1]])
-    around = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
-    for centre in rng.uniform(0, 0.2, (4, 2)):
-        rim = centre + 0.01 * np.column_stack([np.cos(around), np.sin(around)])
-        drawn = np.column_stack([rim, np.ones(len(rim))]) @ homography.T
-        moments = cv2.moments((drawn[:, :2] / drawn[:, 2:]).astype(np.float32))
-        middle = homography @ [*centre, 1]
-        shift = np.array([moments["m10"], moments["m01"]]) / moments["m00"] - middle[:2] / middle[2]
-        assert np.linalg.norm(shift) > 0.01
-        np.testing.assert_allclose(centre_shifts(centre[None], 0.01, homography)[0], shift, atol=2e-3)
-
-
-def test_the_centroid_of_a_disc_under_a_curved_map_is_off_by_the_formula():
-    def bend(p):
-        x, y = p[..., 0], p[..., 1]
-        u = 900 * x + 60 * y + 2500 * x * x + 700 * x * y - 900 * y * y
-        return np.stack([u, -50 * x + 850 * y + 500 * x * x - 1500 * x * y + 1800 * y * y], axis=-1)
-
-    known, radius = SHIFTED.points3D[:, :2] - SHIFTED.points3D[:, :2].mean(axis=0), 0.007
-    shifts = curvature_shifts(known, bend(known), radius)
-    around = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
-    for centre, shift in zip(known[12:24], shifts[12:24], strict=True):
-        rim = bend(centre + radius * np.column_stack([np.cos(around), np.sin(around)])) - bend(centre)
-        moments = cv2.moments(rim.astype(np.float32))
-        expected = np.array([moments["m10"], moments["m01"]]) / moments["m00"]
-        assert np.linalg.norm(expected) > 0.05
-        np.testing.assert_allclose(shift, expected, atol=1e-4)
 
 
 def test_neighbours_predict_a_quadratic_map_and_its_slope():
