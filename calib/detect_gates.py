@@ -14,12 +14,16 @@ from jaxtyping import Float64, Int64
 from calib.boards import Board
 from calib.detect_circles import fit_circles, without_shifts
 from calib.detect_crossings import Expectations, fit_crossings
-from calib.detect_neighbours import Affines, local_affines, predicted
+from calib.detect_neighbours import Affines, local_affines, predicted, predicted_through_lens
+from calib.detect_print import resemblances
 from sfm.core.arrays import Mask, Points2D
 from sfm.core.imaging.noise import noise_sigma
 
 _LEAST_BEND = 0.08
 """Of the distance of neighbours; at the edge of a fisheye image the best quadratic function is off by 0.06."""
+_LEAST_FOR_LENS = 6
+"""Corners without which a plane before a lens, of nine parameters, fits anything."""
+_SUSPECTS = 8
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +49,10 @@ class DetectConfig:
     max_deviation: float = 0.05
     """A corner's standard deviation in its worst direction by the distance to its neighbours: above, its fit went
     astray, as when both edges become one."""
+
+    min_resemblance: float = 0.35
+    """Least correlation of the photo around a corner and what is printed there, for boards with markers: of corners it
+    is 0.45 and more, where there is none -0.25 to 0.1."""
 
     max_bend: float = 6.0
     """Most deviation from where the neighbours want a corner, by the median deviation of the board's corners."""
@@ -76,6 +84,13 @@ class Corners:
         """Those without a reason against them."""
         return np.array([int(number) not in self.reasons for number in self.ids], bool)
 
+    def chosen(self, these: Mask) -> Corners:
+        """A part of them, with what is held against it."""
+        names = ("ids", "sought", "points2D", "covariances", "shapes", "misfit")
+        stay = set(self.ids[these].tolist())
+        reasons = {number: reason for number, reason in self.reasons.items() if number in stay}
+        return Corners(*(getattr(self, name)[these] for name in names), reasons=reasons)
+
     def reject(self, bad: Mask, reason: str) -> None:
         """Notes why these fall; of several reasons the first counts."""
         for number in self.ids[bad]:
@@ -91,7 +106,20 @@ def fitted_crossings(
     grey: np.ndarray, board: Board, ids: np.ndarray, sought: Points2D, affines: Affines, config: DetectConfig,
     expected: Expectations | None = None,
 ) -> Corners:  # fmt: skip
-    """Corners near where they are sought, with a verdict on each.
+    """Corners near where they are sought, with a verdict on each, by itself and beside the others.
+
+    Args: as `single_crossings`.
+    """
+    corners = single_crossings(grey, board, ids, sought, affines, config, expected)
+    judge_together(grey, board, corners, config)
+    return corners
+
+
+def single_crossings(
+    grey: np.ndarray, board: Board, ids: np.ndarray, sought: Points2D, affines: Affines, config: DetectConfig,
+    expected: Expectations | None = None,
+) -> Corners:  # fmt: skip
+    """Corners near where they are sought, with a verdict on each by its own pixels.
 
     Args:
         sought: px; what a corner must not move far from.
@@ -107,9 +135,35 @@ def fitted_crossings(
     corners.reject(jumped, "jumped")
     worst = np.sqrt(np.linalg.norm(np.nan_to_num(fitted.covariances), 2, axis=(1, 2)))
     corners.reject(worst > config.max_deviation * spacing, "too uncertain")
-    _judge_colours(board, corners, config)
-    _judge_places(board, corners, config)
     return corners
+
+
+def joined(first: Corners, second: Corners) -> Corners:
+    """Corners of two lots, none of which is in both, in order of their ids."""
+    order = np.argsort(np.concatenate([first.ids, second.ids]))
+    names = ("ids", "sought", "points2D", "covariances", "shapes", "misfit")
+    columns = (np.concatenate([getattr(first, name), getattr(second, name)])[order] for name in names)
+    return Corners(*columns, reasons=first.reasons | second.reasons)
+
+
+def judge_together(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """What corners of one board must have in common: colours, places on a smooth grid, the print around them."""
+    _judge_colours(board, corners, config)
+    if board.has_markers:
+        _judge_print(grey, board, corners, config)
+        _judge_places_through_lens(board, corners, (grey.shape[1], grey.shape[0]), config)
+    else:
+        _judge_places(board, corners, config)
+
+
+def _judge_print(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """Markers around a corner that are others than printed there, or none."""
+    kept = np.flatnonzero(corners.kept)
+    if len(kept) < 4 or np.linalg.matrix_rank(np.diff(on_board(board, corners.ids[kept]), axis=0), tol=1e-9) < 2:
+        return
+    found = np.full(len(corners.ids), np.nan)
+    found[kept] = resemblances(grey, board, corners.ids[kept], corners.points2D[kept])
+    corners.reject(found < config.min_resemblance, "other print around it")
 
 
 def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None:
@@ -136,6 +190,41 @@ def _judge_places(board: Board, corners: Corners, config: DetectConfig) -> None:
         worst = np.zeros(len(kept), bool)
         worst[np.flatnonzero(kept)[np.argmax(off)]] = True
         corners.reject(worst, "off the grid of its neighbours")
+
+
+def _judge_places_through_lens(board: Board, corners: Corners, size: tuple[int, int], config: DetectConfig) -> None:
+    """As `_judge_places`, for boards of which a few corners may be all that is seen.
+
+    Of these each pulls the prediction of all others towards itself. So those that are farthest off are left out one
+    by one, and the one that the rest contradicts most, by what the rest leaves of itself, is rejected.
+    """
+    while (kept := np.flatnonzero(corners.kept)).size > _LEAST_FOR_LENS:
+        known, points2D = on_board(board, corners.ids[kept]), corners.points2D[kept]
+        off = _off(known, known, points2D, points2D, size)
+        scale = np.median(np.linalg.svd(local_affines(known, points2D), compute_uv=False)) * 2 * board.clear_radius_m
+        least = max(_LEAST_BEND * float(scale), 0.5)
+        if off.max() <= least:
+            return
+        worst, most = -1, 1.0
+        for suspect in np.argsort(-off, kind="stable")[:_SUSPECTS]:
+            rest = np.arange(len(kept)) != suspect
+            others = known[rest], points2D[rest]
+            typical = float(np.median(_off(known[rest], *others, points2D[rest], size)))
+            own = float(_off(known[[suspect]], *others, points2D[[suspect]], size)[0])
+            excess = own / max(config.max_bend * typical, least)
+            if excess > most:
+                worst, most = int(kept[suspect]), excess
+        if worst < 0:
+            return
+        corners.reject(np.arange(len(corners.ids)) == worst, "off the grid of its neighbours")
+
+
+def _off(
+    targets: Points2D, known: np.ndarray, points2D: np.ndarray, seen: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """How far corners are from where others want them, by the gain of these; px."""
+    wanted, gain = predicted_through_lens(targets, known, points2D, size)
+    return np.nan_to_num(np.linalg.norm(wanted - seen, axis=1) / gain, nan=np.inf)
 
 
 def fitted_circles(

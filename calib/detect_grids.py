@@ -106,18 +106,30 @@ def _charucos(grey: Grey, board: Board) -> Iterator[Found]:
 
 
 def _aprilgrids(grey: Grey, board: Board) -> Iterator[Found]:
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary), _marker_parameters(2))
+    """Tags by OpenCV's finder of squares, and by that of the AprilTag library, which bears edges that bend."""
+    dictionary = marker_dictionary(board.dictionary)
     tags: dict[int, Points2D] = {}
     for image in _sizes_for_markers(grey):
-        corners, ids, _ = detector.detectMarkers(image)
-        for number, quad in zip(np.asarray([] if ids is None else ids).reshape(-1), corners, strict=True):
-            if number < board.columns * board.rows:
-                # Kalibr's tags stand on their heads: OpenCV starts at the bottom right and goes to the bottom left.
-                tags.setdefault(int(number), _in_pixels(quad, image, grey)[[1, 0, 3, 2]])
-        if tags:
-            numbers = sorted(tags)
-            ids_of_corners = (4 * np.array(numbers)[:, None] + np.arange(4)).reshape(-1)
-            yield "tags", ids_of_corners, np.concatenate([tags[number] for number in numbers])
+        for by_gradients in (False, True):
+            parameters = _marker_parameters(2)
+            searched = image
+            if by_gradients:
+                parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+                searched = _no_larger(image, _SEARCH_SIZE_PX)
+            corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(searched)
+            for number, quad in zip(np.asarray([] if ids is None else ids).reshape(-1), corners, strict=True):
+                if number < board.columns * board.rows:
+                    # Kalibr's tags stand on their heads: OpenCV starts at the bottom right and goes to the bottom left.
+                    tags.setdefault(int(number), _in_pixels(quad, searched, grey)[[1, 0, 3, 2]])
+            if tags:
+                numbers = sorted(tags)
+                ids_of_corners = (4 * np.array(numbers)[:, None] + np.arange(4)).reshape(-1)
+                yield "tags", ids_of_corners, np.concatenate([tags[number] for number in numbers])
+
+
+def _no_larger(image: Grey, longest: int) -> Grey:
+    ratio = min(1.0, longest / max(image.shape))
+    return resize(image, round(image.shape[1] * ratio), round(image.shape[0] * ratio)) if ratio < 1 else image
 
 
 def _sizes_for_markers(grey: Grey) -> Iterator[Grey]:

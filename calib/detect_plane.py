@@ -22,6 +22,8 @@ from jaxtyping import Float64
 
 from sfm.core.arrays import Points2D, Value
 
+_TIE_PX = 1e-3
+"""Of coefficients whose errors differ by less that nearest to zero is taken: four corners say nothing about it."""
 _COEFFICIENTS = (0.1, 0.0, -0.03, -0.1, -0.2, -0.35, -0.5, -0.75, -1.0, -1.4, -2.0, -3.0)
 
 
@@ -67,7 +69,7 @@ def fit_plane(board_points: Points2D, points2D: Points2D, size: tuple[int, int])
     for coefficient in _COEFFICIENTS:
         homography = _homography(normed, offsets, coefficient) @ scale
         plane = LensedPlane(homography, coefficient, middle, unit)
-        error = float(np.square(plane.image(board_points) - points2D).mean())
+        error = float(np.square(plane.image(board_points) - points2D).mean()) + _TIE_PX**2 * abs(coefficient)
         if error < least:
             best, least = plane, error
     return best
