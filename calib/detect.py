@@ -9,6 +9,7 @@ See `detect_gates` for what a corner must pass to stay.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -109,7 +110,7 @@ def detect_board(
     least = config.min_corners if board.has_markers else max(4, int(np.ceil(config.min_share * len(board.points3D))))
     kept = best.kept
     if kept.sum() < least:
-        return Rejected("too_few_corners", f"{kept.sum()} of {len(board.points3D)} passed, {least} needed")
+        return Rejected("too_few_corners", _too_few(board, best, least))
     blur = best.shapes[kept, 4]
     return Detection(
         name,
@@ -123,6 +124,14 @@ def detect_board(
         best_finder,
         float(np.median(blur)) if np.isfinite(blur).any() else float("nan"),
     )
+
+
+def _too_few(board: Board, corners: Corners, least: int) -> str:
+    """How many corners passed, and why the others did not, the most frequent reason first."""
+    told = f"{corners.kept.sum()} of {len(board.points3D)} passed, {least} needed"
+    counts = Counter(corners.reasons[number] for number in sorted(corners.reasons))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    return f"{told}; rejected: {reasons}" if reasons else told
 
 
 def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig) -> Corners | None:

@@ -41,7 +41,7 @@ class DetectConfig:
     """A corner that moves by more of the distance to its neighbours when it is made precise was none."""
 
     max_misfit: float = 0.35
-    """Residuals of a corner's pixels by its contrast: above, they show something else."""
+    """Residuals of a corner's pixels less the noise of the photo, by its contrast: above, they show something else."""
 
     min_contrast: float = 0.2
     """Least contrast by the median of the board."""
@@ -148,7 +148,7 @@ def joined(first: Corners, second: Corners) -> Corners:
 
 def judge_together(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
     """What corners of one board must have in common: colours, places on a smooth grid, the print around them."""
-    _judge_colours(board, corners, config)
+    _judge_colours(grey, board, corners, config)
     if board.has_markers:
         _judge_print(grey, board, corners, config)
         _judge_places_through_lens(board, corners, (grey.shape[1], grey.shape[0]), config)
@@ -166,15 +166,20 @@ def _judge_print(grey: np.ndarray, board: Board, corners: Corners, config: Detec
     corners.reject(found < config.min_resemblance, "other print around it")
 
 
-def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None:
-    """Contrast, its sign and what the model leaves of the pixels."""
+def _judge_colours(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """Contrast, its sign and what the model and the noise of the photo leave of the pixels."""
     signed = np.where(board.diagonal_is_black[corners.ids], 1, -1) * corners.shapes[:, 6]
     if np.nansum(np.sign(signed)) < 0:  # the older ChArUco layout, or a board printed in reverse
         signed = -signed
     typical = np.nanmedian(np.abs(signed)) if np.isfinite(signed).any() else 0.0
     corners.reject(signed < 0, "black where white should be")
     corners.reject(np.abs(signed) < config.min_contrast * typical, "too little contrast")
-    corners.reject(corners.misfit > config.max_misfit, "unlike a crossing")
+    unlike = corners.misfit > config.max_misfit
+    if unlike.any():
+        left, contrast = corners.misfit * np.abs(signed), np.abs(signed)
+        noise = min(255 * noise_sigma(np.ascontiguousarray(grey)), float(np.nanmedian(left)))
+        unlike &= np.sqrt(np.maximum(left**2 - noise**2, 0)) > config.max_misfit * contrast
+    corners.reject(unlike, "unlike a crossing")
 
 
 def _judge_places(board: Board, corners: Corners, config: DetectConfig) -> None:
