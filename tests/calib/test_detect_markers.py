@@ -62,3 +62,23 @@ def test_a_crossing_that_an_object_makes_is_no_corner(plain):
     assert isinstance(seen, Detection)
     assert np.abs(seen.points2D - truth[seen.corner_ids]).max() < 1
     assert len(seen.corner_ids) >= len(truth) - 4
+
+
+def test_markers_that_are_white_on_black_are_read(plain):
+    photo, truth = plain
+    seen = detect_board(255 - photo, CHARUCO)
+    usual = detect_board(photo, CHARUCO)
+    assert isinstance(seen, Detection)
+    assert isinstance(usual, Detection)
+    assert "white on black" in seen.finder
+    np.testing.assert_array_equal(seen.corner_ids, usual.corner_ids)
+    assert np.abs(seen.points2D - truth[seen.corner_ids]).max() < 0.1
+
+
+def test_a_small_board_before_a_fisheye_is_read_from_few_of_its_markers():
+    board = charuco(8, 6, 0.03, 0.022)
+    photo, truth = views.render(board, WIDE, views.pose(board, 0.21, 40, 60, 15, shift=(0.17, 0.05)))
+    seen = detect_board(photo, board)
+    assert isinstance(seen, Detection)
+    assert len(seen.corner_ids) >= 28
+    assert np.abs(seen.points2D - truth[seen.corner_ids]).max() < 0.5
