@@ -64,9 +64,23 @@ def artwork(board: Board) -> Artwork:
     return _circles(board)
 
 
-def marker_squares(columns: int, rows: int) -> list[tuple[int, int]]:
-    """(column, row) of the white squares of a chessboard that is black at the top left, in the order of the markers."""
-    return [(column, row) for row in range(rows) for column in range(columns) if (column + row) % 2]
+def older_charuco(board: Board) -> Artwork:
+    """A ChArUco board in OpenCV's layout before 4.6: one with an even number of rows is white at the top left.
+
+    Raises:
+        ValueError: as `artwork`.
+    """
+    first = (board.rows + 1) % 2
+    return _chessboard(board, board.columns, board.rows, _charuco_markers(board, first), first)
+
+
+def marker_squares(columns: int, rows: int, first: int = 0) -> list[tuple[int, int]]:
+    """(column, row) of the white squares of a chessboard, in the order of the markers.
+
+    Args:
+        first: 0 if the board is black at the top left, 1 if it is white there.
+    """
+    return [(column, row) for row in range(rows) for column in range(columns) if (column + row) % 2 != first]
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -110,17 +124,17 @@ def marker_cells(dictionary: str, marker: int, border: int) -> Bool[np.ndarray, 
     return markers.generateImageMarker(marker, markers.markerSize + 2 * border, borderBits=border) > 127
 
 
-def _chessboard(board: Board, columns: int, rows: int, white: Float64[np.ndarray, "W 4"]) -> Artwork:
+def _chessboard(board: Board, columns: int, rows: int, white: Float64[np.ndarray, "W 4"], first: int = 0) -> Artwork:
     side, margin = board.pitch_m, _QUIET * board.pitch_m
     black = [
         (margin + column * side, margin + row * side, side, side)
         for row in range(rows)
         for column in range(columns)
-        if (column + row) % 2 == 0
+        if (column + row) % 2 == first
     ]
     markers = [
         (margin + (column + 0.5) * side - board.detail_m / 2, margin + (row + 0.5) * side - board.detail_m / 2)
-        for column, row in (marker_squares(columns, rows) if board.kind == "charuco" else [])
+        for column, row in (marker_squares(columns, rows, first) if board.kind == "charuco" else [])
     ]
     black += [(x, y, board.detail_m, board.detail_m) for x, y in markers]
     return Artwork(
@@ -133,14 +147,14 @@ def _chessboard(board: Board, columns: int, rows: int, white: Float64[np.ndarray
     )
 
 
-def _charuco_markers(board: Board) -> Rectangles:
+def _charuco_markers(board: Board, first: int = 0) -> Rectangles:
     """White cells of all markers; the squares of the board begin at the origin."""
     inset = (board.pitch_m - board.detail_m) / 2
     return np.concatenate(
         [
             _white_cells(marker_cells(board.dictionary, marker, 1), board.detail_m)
             + np.array([column * board.pitch_m + inset, row * board.pitch_m + inset, 0, 0])
-            for marker, (column, row) in enumerate(marker_squares(board.columns, board.rows))
+            for marker, (column, row) in enumerate(marker_squares(board.columns, board.rows, first))
         ]
     )
 

@@ -9,6 +9,7 @@ See `detect_gates` for what a corner must pass to stay.
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -17,14 +18,25 @@ from jaxtyping import Float64, Int64, UInt8
 
 from calib.boards import Board
 from calib.detect_crossings import expectations, fit_crossings
-from calib.detect_gates import Corners, DetectConfig, fitted_circles, fitted_crossings, on_board
+from calib.detect_gates import (
+    Corners,
+    DetectConfig,
+    fitted_circles,
+    fitted_crossings,
+    joined,
+    judge_together,
+    on_board,
+    single_crossings,
+)
 from calib.detect_grids import Found, candidates
 from calib.detect_lines import absent_lines, moved
-from calib.detect_neighbours import Affines, local_affines, predicted
+from calib.detect_neighbours import Affines, local_affines, predicted, predicted_through_lens
 from sfm.core.arrays import Points2D, Value, readonly
 from sfm.core.errors import Rejected
 
-_ROUNDS_OF_COMPLETION = 8
+_ROUNDS_OF_COMPLETION = 24
+_LEAST_TO_START = 4
+"""Corners to complete a board from, those of one tag."""
 _LARGEST_GAIN = 3.0
 """Corners that are sought without a marker are within or next to those that are known: errors of the neighbours are
 amplified by no more than this. Farther out, something else would be found and agree with itself."""
@@ -98,7 +110,7 @@ def detect_board(
     least = config.min_corners if board.has_markers else max(4, int(np.ceil(config.min_share * len(board.points3D))))
     kept = best.kept
     if kept.sum() < least:
-        return Rejected("too_few_corners", f"{kept.sum()} of {len(board.points3D)} passed, {least} needed")
+        return Rejected("too_few_corners", _too_few(board, best, least))
     blur = best.shapes[kept, 4]
     return Detection(
         name,
@@ -112,6 +124,14 @@ def detect_board(
         best_finder,
         float(np.median(blur)) if np.isfinite(blur).any() else float("nan"),
     )
+
+
+def _too_few(board: Board, corners: Corners, least: int) -> str:
+    """How many corners passed, and why the others did not, the most frequent reason first."""
+    told = f"{corners.kept.sum()} of {len(board.points3D)} passed, {least} needed"
+    counts = Counter(corners.reasons[number] for number in sorted(corners.reasons))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    return f"{told}; rejected: {reasons}" if reasons else told
 
 
 def _precise(grey: np.ndarray, board: Board, found: Found, config: DetectConfig) -> Corners | None:
@@ -174,31 +194,33 @@ def _completed(grey: np.ndarray, board: Board, corners: Corners, config: DetectC
 
     What is not there after all fails the same gates; only corners that pass are added.
     """
+    size = (grey.shape[1], grey.shape[0])
     for _ in range(_ROUNDS_OF_COMPLETION):
         kept = corners.kept
         absent = np.setdiff1d(np.arange(len(board.points3D)), corners.ids[kept])
-        if kept.sum() < config.min_corners or not len(absent):
+        if kept.sum() < _LEAST_TO_START or not len(absent):
             return corners
         known, points2D = on_board(board, corners.ids[kept]), corners.points2D[kept]
         try:
             local_affines(known, points2D)
         except ValueError:
             return corners
-        expected, gain = predicted(on_board(board, absent), known, points2D)
-        inside = (gain < _LARGEST_GAIN) & ((expected > 0) & (expected < [grey.shape[1], grey.shape[0]])).all(axis=1)
-        ids = np.concatenate([corners.ids[kept], absent[inside]])
-        order = np.argsort(ids)
-        sought = np.concatenate([points2D, expected[inside]])[order]
-        tried = fitted_crossings(
-            grey, board, ids[order], sought, local_affines(on_board(board, ids[order]), sought), config
-        )
-        if tried.kept.sum() <= kept.sum():
+        expected, gain = predicted_through_lens(on_board(board, absent), known, points2D, size)
+        inside = (gain < _LARGEST_GAIN) & ((expected > 0) & (expected < size)).all(axis=1)
+        if not inside.any():
             return corners
-        is_old = np.isin(tried.ids, corners.ids)
-        told = {number: reason for number, reason in tried.reasons.items() if number in set(tried.ids[is_old].tolist())}
-        stays = tried.kept | is_old
-        fields = (tried.ids, tried.sought, tried.points2D, tried.covariances, tried.shapes, tried.misfit)
-        corners = Corners(*(values[stays] for values in fields), reasons=told)
+        places = np.concatenate([known, on_board(board, absent[inside])])
+        affines = local_affines(places, np.concatenate([points2D, expected[inside]]))[len(known) :]
+        tried = single_crossings(grey, board, absent[inside], expected[inside], affines, config)
+        new = tried.chosen(tried.kept)
+        if not len(new.ids):
+            return corners
+        again = joined(corners.chosen(~np.isin(corners.ids, new.ids)), new)
+        judge_together(grey, board, again, config)
+        is_old = np.isin(again.ids, corners.ids)
+        if again.kept.sum() <= kept.sum():
+            return corners
+        corners = again.chosen(again.kept | is_old)
     return corners
 
 

@@ -14,10 +14,17 @@ from jaxtyping import Float64, Int64
 from calib.boards import Board
 from calib.detect_circles import fit_circles, with_dark_circles, without_shifts
 from calib.detect_crossings import Expectations, fit_crossings
-from calib.detect_neighbours import Affines
-from calib.detect_places import misplaced
+from calib.detect_neighbours import Affines, local_affines, predicted_through_lens
+from calib.detect_places import LEAST_BEND, LEAST_BEND_PX, misplaced
+from calib.detect_print import resemblances
 from sfm.core.arrays import Mask, Points2D
 from sfm.core.imaging.noise import noise_sigma
+
+_LEAST_FOR_LENS = 6
+"""Corners without which a plane before a lens, of nine parameters, fits anything."""
+_FEW = 48
+"""Corners up to which each pulls the predictions of all others towards itself."""
+_SUSPECTS = 8
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +42,7 @@ class DetectConfig:
     """A corner that moves by more of the distance to its neighbours when it is made precise was none."""
 
     max_misfit: float = 0.35
-    """Residuals of a corner's pixels by its contrast: above, they show something else."""
+    """Residuals of a corner's pixels less the noise of the photo, by its contrast: above, they show something else."""
 
     min_contrast: float = 0.2
     """Least contrast by the median of the board."""
@@ -47,6 +54,10 @@ class DetectConfig:
     max_turn_deg: float = 25.0
     """An edge of a crossing that is turned by more from where the neighbours of the corner lie is none of the board's:
     at the outer corners of the outer squares a fit finds two edges of its own. Photos of boards stay below 8."""
+
+    min_resemblance: float = 0.35
+    """Least correlation of the photo around a corner and what is printed there, for boards with markers: of corners it
+    is 0.45 and more, where there is none -0.25 to 0.1."""
 
     max_bend: float = 6.0
     """Most deviation from where the neighbours want a corner, by the median deviation of the board's corners."""
@@ -78,6 +89,13 @@ class Corners:
         """Those without a reason against them."""
         return np.array([int(number) not in self.reasons for number in self.ids], bool)
 
+    def chosen(self, these: Mask) -> Corners:
+        """A part of them, with what is held against it."""
+        names = ("ids", "sought", "points2D", "covariances", "shapes", "misfit")
+        stay = set(self.ids[these].tolist())
+        reasons = {number: reason for number, reason in self.reasons.items() if number in stay}
+        return Corners(*(getattr(self, name)[these] for name in names), reasons=reasons)
+
     def reject(self, bad: Mask, reason: str) -> None:
         """Notes why these fall; of several reasons the first counts."""
         for number in self.ids[bad]:
@@ -93,7 +111,20 @@ def fitted_crossings(
     grey: np.ndarray, board: Board, ids: np.ndarray, sought: Points2D, affines: Affines, config: DetectConfig,
     expected: Expectations | None = None,
 ) -> Corners:  # fmt: skip
-    """Corners near where they are sought, with a verdict on each.
+    """Corners near where they are sought, with a verdict on each, by itself and beside the others.
+
+    Args: as `single_crossings`.
+    """
+    corners = single_crossings(grey, board, ids, sought, affines, config, expected)
+    judge_together(grey, board, corners, config)
+    return corners
+
+
+def single_crossings(
+    grey: np.ndarray, board: Board, ids: np.ndarray, sought: Points2D, affines: Affines, config: DetectConfig,
+    expected: Expectations | None = None,
+) -> Corners:  # fmt: skip
+    """Corners near where they are sought, with a verdict on each by its own pixels.
 
     Args:
         sought: px; what a corner must not move far from.
@@ -111,8 +142,6 @@ def fitted_crossings(
     corners.reject(worst > config.max_deviation * spacing, "too uncertain")
     turned = _edges_turned_by(fitted.shapes[:, 2:4], affines)
     corners.reject(turned > np.radians(config.max_turn_deg), "edges that run otherwise")
-    _judge_colours(board, corners, config)
-    _judge_places(board, corners, config)
     return corners
 
 
@@ -122,15 +151,49 @@ def _edges_turned_by(angles: Float64[np.ndarray, "N 2"], affines: Affines) -> Fl
     return np.abs((angles - along + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
 
 
-def _judge_colours(board: Board, corners: Corners, config: DetectConfig) -> None:
-    """Contrast, its sign and what the model leaves of the pixels."""
+def joined(first: Corners, second: Corners) -> Corners:
+    """Corners of two lots, none of which is in both, in order of their ids."""
+    order = np.argsort(np.concatenate([first.ids, second.ids]))
+    names = ("ids", "sought", "points2D", "covariances", "shapes", "misfit")
+    columns = (np.concatenate([getattr(first, name), getattr(second, name)])[order] for name in names)
+    return Corners(*columns, reasons=first.reasons | second.reasons)
+
+
+def judge_together(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """What corners of one board must have in common: colours, places on a smooth grid, the print around them."""
+    _judge_colours(grey, board, corners, config)
+    if board.has_markers:
+        _judge_print(grey, board, corners, config)
+    if board.has_markers and corners.kept.sum() <= _FEW:
+        _judge_places_through_lens(board, corners, (grey.shape[1], grey.shape[0]), config)
+    else:
+        _judge_places(board, corners, config)
+
+
+def _judge_print(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """Markers around a corner that are others than printed there, or none."""
+    kept = np.flatnonzero(corners.kept)
+    if len(kept) < 4 or np.linalg.matrix_rank(np.diff(on_board(board, corners.ids[kept]), axis=0), tol=1e-9) < 2:
+        return
+    found = np.full(len(corners.ids), np.nan)
+    found[kept] = resemblances(grey, board, corners.ids[kept], corners.points2D[kept])
+    corners.reject(found < config.min_resemblance, "other print around it")
+
+
+def _judge_colours(grey: np.ndarray, board: Board, corners: Corners, config: DetectConfig) -> None:
+    """Contrast, its sign and what the model and the noise of the photo leave of the pixels."""
     signed = np.where(board.diagonal_is_black[corners.ids], 1, -1) * corners.shapes[:, 6]
     if np.nansum(np.sign(signed)) < 0:  # the older ChArUco layout, or a board printed in reverse
         signed = -signed
     typical = np.nanmedian(np.abs(signed)) if np.isfinite(signed).any() else 0.0
     corners.reject(signed < 0, "black where white should be")
     corners.reject(np.abs(signed) < config.min_contrast * typical, "too little contrast")
-    corners.reject(corners.misfit > config.max_misfit, "unlike a crossing")
+    unlike = corners.misfit > config.max_misfit
+    if unlike.any():
+        left, contrast = corners.misfit * np.abs(signed), np.abs(signed)
+        noise = min(255 * noise_sigma(np.ascontiguousarray(grey)), float(np.nanmedian(left)))
+        unlike &= np.sqrt(np.maximum(left**2 - noise**2, 0)) > config.max_misfit * contrast
+    corners.reject(unlike, "unlike a crossing")
 
 
 def _judge_places(board: Board, corners: Corners, config: DetectConfig) -> None:
@@ -140,6 +203,41 @@ def _judge_places(board: Board, corners: Corners, config: DetectConfig) -> None:
         on_board(board, corners.ids[bad]), corners.points2D[bad], board.clear_radius_m, config.max_bend
     )
     corners.reject(bad, "off the grid of its neighbours")
+
+
+def _judge_places_through_lens(board: Board, corners: Corners, size: tuple[int, int], config: DetectConfig) -> None:
+    """As `_judge_places`, for boards of which a few corners may be all that is seen.
+
+    Of these each pulls the prediction of all others towards itself. So those that are farthest off are left out one
+    by one, and the one that the rest contradicts most, by what the rest leaves of itself, is rejected.
+    """
+    while (kept := np.flatnonzero(corners.kept)).size > _LEAST_FOR_LENS:
+        known, points2D = on_board(board, corners.ids[kept]), corners.points2D[kept]
+        off = _off(known, known, points2D, points2D, size)
+        scale = np.median(np.linalg.svd(local_affines(known, points2D), compute_uv=False)) * 2 * board.clear_radius_m
+        least = max(LEAST_BEND * float(scale), LEAST_BEND_PX)
+        if off.max() <= least:
+            return
+        worst, most = -1, 1.0
+        for suspect in np.argsort(-off, kind="stable")[:_SUSPECTS]:
+            rest = np.arange(len(kept)) != suspect
+            others = known[rest], points2D[rest]
+            typical = float(np.median(_off(known[rest], *others, points2D[rest], size)))
+            own = float(_off(known[[suspect]], *others, points2D[[suspect]], size)[0])
+            excess = own / max(config.max_bend * typical, least)
+            if excess > most:
+                worst, most = int(kept[suspect]), excess
+        if worst < 0:
+            return
+        corners.reject(np.arange(len(corners.ids)) == worst, "off the grid of its neighbours")
+
+
+def _off(
+    targets: Points2D, known: np.ndarray, points2D: np.ndarray, seen: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """How far corners are from where others want them, by the gain of these; px."""
+    wanted, gain = predicted_through_lens(targets, known, points2D, size)
+    return np.nan_to_num(np.linalg.norm(wanted - seen, axis=1) / gain, nan=np.inf)
 
 
 def fitted_circles(

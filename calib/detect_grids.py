@@ -90,45 +90,62 @@ def _in_pixels(corners: np.ndarray, image: np.ndarray, grey: np.ndarray) -> Poin
 
 
 def _charucos(grey: Grey, board: Board) -> Iterator[Found]:
+    """The board in both layouts; white on black, as heat cameras may show it, where no black marker is seen."""
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
     size, dictionary = (board.columns, board.rows), marker_dictionary(board.dictionary)
     for image in _sizes_for_markers(grey):
-        best: Found | None = None
-        for legacy in (False, True) if board.rows % 2 == 0 else (False,):
-            # The ratio of the lengths matters, their unit does not.
-            layout = cv2.aruco.CharucoBoard(size, 1.0, board.detail_m / board.pitch_m, dictionary)
-            layout.setLegacyPattern(legacy)
-            detector = cv2.aruco.CharucoDetector(layout, parameters, _marker_parameters(1))
-            corners, ids, _, _ = detector.detectBoard(image)
-            if ids is None or not len(ids) or (best and len(ids) <= len(best[1])):
-                continue
-            name = "markers, older layout" if legacy else "markers"
-            best = name, np.asarray(ids).reshape(-1).astype(np.int64), _in_pixels(corners, image, grey)
-        if best:
-            yield best
+        for inverted in (False, True):
+            best: Found | None = None
+            markers = _marker_parameters(1)
+            markers.detectInvertedMarker = inverted
+            for legacy in (False, True) if board.rows % 2 == 0 else (False,):
+                # The ratio of the lengths matters, their unit does not.
+                layout = cv2.aruco.CharucoBoard(size, 1.0, board.detail_m / board.pitch_m, dictionary)
+                layout.setLegacyPattern(legacy)
+                corners, ids, _, _ = cv2.aruco.CharucoDetector(layout, parameters, markers).detectBoard(image)
+                if ids is None or not len(ids) or (best and len(ids) <= len(best[1])):
+                    continue
+                name = "markers" + ", white on black" * inverted + ", older layout" * legacy
+                best = name, np.asarray(ids).reshape(-1).astype(np.int64), _in_pixels(corners, image, grey)
+            if best:
+                yield best
+                break
 
 
 def _aprilgrids(grey: Grey, board: Board) -> Iterator[Found]:
-    detector = cv2.aruco.ArucoDetector(marker_dictionary(board.dictionary), _marker_parameters(2))
+    """Tags by OpenCV's finder of squares, and by that of the AprilTag library, which bears edges that bend."""
+    dictionary = marker_dictionary(board.dictionary)
     tags: dict[int, Points2D] = {}
     for image in _sizes_for_markers(grey):
-        corners, ids, _ = detector.detectMarkers(image)
-        for number, quad in zip(np.asarray([] if ids is None else ids).reshape(-1), corners, strict=True):
-            if number < board.columns * board.rows:
-                # Kalibr's tags stand on their heads: OpenCV starts at the bottom right and goes to the bottom left.
-                tags.setdefault(int(number), _in_pixels(quad, image, grey)[[1, 0, 3, 2]])
-        if tags:
-            numbers = sorted(tags)
-            ids_of_corners = (4 * np.array(numbers)[:, None] + np.arange(4)).reshape(-1)
-            yield "tags", ids_of_corners, np.concatenate([tags[number] for number in numbers])
+        for by_gradients in (False, True):
+            parameters = _marker_parameters(2)
+            searched = image
+            if by_gradients:
+                parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
+                searched = _no_larger(image, _SEARCH_SIZE_PX)
+            corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(searched)
+            for number, quad in zip(np.asarray([] if ids is None else ids).reshape(-1), corners, strict=True):
+                if number < board.columns * board.rows:
+                    # Kalibr's tags stand on their heads: OpenCV starts at the bottom right and goes to the bottom left.
+                    tags.setdefault(int(number), _in_pixels(quad, searched, grey)[[1, 0, 3, 2]])
+            if tags:
+                numbers = sorted(tags)
+                ids_of_corners = (4 * np.array(numbers)[:, None] + np.arange(4)).reshape(-1)
+                yield "tags", ids_of_corners, np.concatenate([tags[number] for number in numbers])
+
+
+def _no_larger(image: Grey, longest: int) -> Grey:
+    ratio = min(1.0, longest / max(image.shape))
+    return resize(image, round(image.shape[1] * ratio), round(image.shape[0] * ratio)) if ratio < 1 else image
 
 
 def _sizes_for_markers(grey: Grey) -> Iterator[Grey]:
-    """The photo, and twice as large where it is small: cells of less than two pixels cannot be read."""
+    """The photo, and larger where it is small: cells of less than two pixels cannot be read."""
     yield grey
-    if max(grey.shape) <= _SEARCH_SIZE_PX:
-        yield resize(grey, 2 * grey.shape[1], 2 * grey.shape[0])
+    for times, longest in ((2, _SEARCH_SIZE_PX), (3, _SMALL_PX)):
+        if max(grey.shape) <= longest:
+            yield resize(grey, times * grey.shape[1], times * grey.shape[0])
 
 
 def _marker_parameters(border_cells: int) -> cv2.aruco.DetectorParameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from calib.detect_plane import LensedPlane
+from calib.detect_plane import LensedPlane, fit_plane
 from sfm.core.arrays import Indices, Points2D
 
 Affines = Float64[np.ndarray, "N 2 2"]
@@ -17,6 +17,8 @@ FOR_PREDICTION = 16
 _LEAST_FOR_QUADRATIC = 9
 _DEGREES = ((2, 12), (3, 16))
 """Of the polynomials through the neighbours that tell how edges bend, and how many these are."""
+_FAR = 3.0
+"""Gain of errors from which on the neighbours do not tell how what a plane leaves bends."""
 _UNSURE = 0.3
 """Part of a curvature that may be wrong where only one degree tells it."""
 _STEP = 1e-3
@@ -51,7 +53,7 @@ def local_affines(
 
 
 def predicted(
-    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"]
+    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"], degree: int = 2
 ) -> tuple[Points2D, Float64[np.ndarray, " N"]]:
     """Where corners must be in the image if board and lens are smooth, each from its nearest neighbours but itself.
 
@@ -60,22 +62,45 @@ def predicted(
     Args:
         targets: (x, y) on the board of the corners asked for.
         board_points: of those that are known.
+        degree: of the function, 1 or 2.
     Returns:
         Their pixels; and by how much the errors of the neighbours are amplified: the deviation of a predicted
         from a measured place, where all errors are 1. At the border of a board it is several times that within.
     """
-    wanted, gain, _ = foretold(targets, board_points, points2D)
+    wanted, gain, _ = foretold(targets, board_points, points2D, degree)
     return wanted, gain
 
 
 def foretold(
-    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"]
-) -> tuple[Points2D, Float64[np.ndarray, " N"], Int64[np.ndarray, "N M"]]:
+    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"],
+    degree: int = 2,
+) -> tuple[Points2D, Float64[np.ndarray, " N"], Int64[np.ndarray, "N M"]]:  # fmt: skip
     """What `predicted` says, and the rows of the neighbours that say it, at most `FOR_PREDICTION`."""
     order, steps, _ = _neighbourhoods(targets, board_points, FOR_PREDICTION)
     # Where neighbours are on a line, the pseudo-inverse takes the flattest function through them.
-    weights = np.linalg.pinv(_terms(steps, 2 if order.shape[1] >= _LEAST_FOR_QUADRATIC else 1), rcond=1e-4)[:, 0]
+    weights = np.linalg.pinv(_terms(steps, degree if order.shape[1] >= _LEAST_FOR_QUADRATIC else 1), rcond=1e-4)[:, 0]
     return np.einsum("nk,nkd->nd", weights, points2D[order]), np.sqrt(1 + np.square(weights).sum(axis=1)), order
+
+
+def predicted_through_lens(
+    targets: Points2D, board_points: Float64[np.ndarray, "K 2"], points2D: Float64[np.ndarray, "K 2"],
+    size: tuple[int, int],
+) -> tuple[Points2D, Float64[np.ndarray, " N"]]:  # fmt: skip
+    """As `predicted`, of what a plane before a lens leaves: a few corners tell what lies a square beside them.
+
+    Far from all that are known, where a quadratic function amplifies errors, an affine one is taken.
+
+    Args:
+        size: width and height of the image, px.
+    Returns:
+        NaN where the plane has no image.
+    """
+    plane = fit_plane(board_points, points2D, size)
+    remains = points2D - plane.image(board_points)
+    left, gain = predicted(targets, board_points, remains)
+    flat, flat_gain = predicted(targets, board_points, remains, degree=1)
+    far = gain > _FAR
+    return plane.image(targets) + np.where(far[:, None], flat, left), np.where(far, flat_gain, gain)
 
 
 def local_curvatures(

@@ -24,6 +24,8 @@ from scipy.optimize import minimize_scalar
 
 from sfm.core.arrays import Points2D, Value
 
+_TIE_PX = 1e-3
+"""Of coefficients whose errors differ by less that nearest to zero is taken: four corners say nothing about it."""
 _COEFFICIENTS = (0.1, 0.0, -0.03, -0.1, -0.2, -0.35, -0.5, -0.75, -1.0, -1.4, -2.0, -3.0)
 _CLOSE = 1e-4
 _NONE = 1e12
@@ -91,11 +93,11 @@ def _planes(board_points: Points2D, points2D: Points2D, size: tuple[int, int]) -
 
 
 def _error_at(board_points: Points2D, points2D: Points2D) -> Callable[[LensedPlane], float]:
-    """Mean squared distance, px²; beyond all measure where a point has no image."""
+    """Mean squared distance, px², with a little for the coefficient; beyond all measure where a point has no image."""
 
     def error(plane: LensedPlane) -> float:
         mean = float(np.square(plane.image(board_points) - points2D).mean())
-        return mean if np.isfinite(mean) else _NONE
+        return mean + _TIE_PX**2 * abs(plane.coefficient) if np.isfinite(mean) else _NONE
 
     return error
 

@@ -109,6 +109,23 @@ def test_a_corner_that_is_covered_is_rejected_with_a_reason_and_the_others_stay(
     assert np.abs(errors(seen, truth)).max() < 0.1
 
 
+def test_noise_of_a_third_of_the_contrast_is_no_reason_to_doubt_a_corner(upright, rng):
+    photo, truth = upright
+    faint = 110 + photo * (20 / 255)
+    noisy = np.clip(np.rint(faint + rng.normal(0, 2.7, photo.shape)), 0, 255).astype(np.uint8)
+    seen = detect_board(noisy, CHESSBOARD)
+    assert isinstance(seen, Detection)
+    assert len(seen.corner_ids) == 54
+    assert np.abs(errors(seen, truth)).max() < 0.6
+
+
+def test_a_photo_that_is_refused_says_what_is_wrong_with_its_corners(upright):
+    photo, _ = upright
+    seen = detect_board(photo, CHESSBOARD, DetectConfig(max_misfit=0.001))
+    assert isinstance(seen, Rejected)
+    assert "unlike a crossing" in seen.detail
+
+
 @pytest.mark.parametrize("board", [CHARUCO, APRILGRID], ids=lambda board: board.kind)
 def test_a_board_with_markers_is_known_by_a_part_of_it(board):
     where = views.pose(board, 0.22, 15, 20, 10, shift=(0.07, 0.05))
