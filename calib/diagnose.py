@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from calib.coverage import coverage
+from calib.diagnose_changes import OwnCameras, changed_camera
 from calib.refine import Calibration
 from calib.uncertainty import CalibrationCovariance, covariance, uncertainty_map
 from calib.whiteness import whiteness
@@ -30,6 +31,8 @@ _UNCOVERED = 0.15
 _VIEW_FACTOR, _VIEW_PX = 2.0, 0.1
 """Times the median error of views, and px, that one is named at."""
 _UNCERTAIN_PX = 1.0
+_NAMED = 12
+"""Photos that a finding names."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -48,13 +51,20 @@ def board_tilts(found: Calibration) -> tuple[Vector, Vector]:
     return np.arccos(np.clip(normals[:, 2], -1, 1)), np.arctan2(normals[:, 1], normals[:, 0])
 
 
-def diagnose(found: Calibration, doubts: CalibrationCovariance | Rejected | None = None) -> tuple[Finding, ...]:
+def diagnose(
+    found: Calibration, doubts: CalibrationCovariance | Rejected | None = None, *, is_explained: bool = False
+) -> tuple[Finding, ...]:
     """What is wrong, the gravest first; nothing where nothing was found.
 
     Args:
         doubts: how uncertain it is; by default by views, or its lower bound where these are too few.
+        is_explained: a cause is known already for which photos disagree, as that some are turned.
     """
-    told = (finding for part in (_solution, _views, _poses, _shape_of_residuals) for finding in part(found))
+    changed = None if is_explained else changed_camera(found)
+    parts = (_views, _poses) if is_explained or changed else (_views, _poses, _shape_of_residuals)
+    told = [*_solution(found), *_changes(changed), *(finding for part in parts for finding in part(found))]
+    if changed:  # what is a single photo's fault cannot be told from what is its own camera's
+        told = [finding for finding in told if finding.cause != "outlier_view"]
     return (*told, *_reach(found, _doubts(found) if doubts is None else doubts))
 
 
@@ -81,6 +91,47 @@ def _solution(found: Calibration) -> Iterator[Finding]:
             f"{math.degrees(worst):.0f}°",
             "show the board in the corners of the image, or take a lens model with fewer coefficients",
         )
+
+
+def _changes(changed: OwnCameras | None) -> Iterator[Finding]:
+    if changed is None:
+        return
+    falls = f"the error falls from {px(changed.rms_px)} to {px(changed.own_rms_px)} px"
+    if changed.kind == "focal":
+        yield Finding(
+            "changed_focus",
+            f"{_by_how_much(changed)}; with a focal length of its own for each photo {falls}",
+            "hold focus and zoom (no autofocus, rings taped) and take the photos anew, or calibrate from those of one "
+            "setting alone",
+        )
+    else:
+        yield Finding(
+            "moved_principal_point",
+            f"{_by_how_much(changed)}; with a principal point of its own for each photo {falls}",
+            "switch stabilisers of lens and sensor off, leave photos uncropped, and take them anew",
+        )
+
+
+def _by_how_much(changed: OwnCameras) -> str:
+    names, own = changed.names, changed.own
+    if changed.apart:
+        few = list(changed.apart)
+        told = ", ".join(names[v] for v in few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if few[_NAMED:] else "")
+        off = own[few].mean(0) - np.delete(own, few, axis=0).mean(0)
+        if changed.kind == "focal":
+            return f"{told}: the focal length is {100 * math.expm1(off[0]):+.2g} % off that of the other photos"
+        return f"{told}: the principal point is ({off[0]:+.1f}, {off[1]:+.1f}) px off that of the other photos"
+    if changed.kind == "focal":
+        low, high = int(np.argmin(own[:, 0])), int(np.argmax(own[:, 0]))
+        part = 100 * math.expm1(own[high, 0] - own[low, 0])
+        return f"the focal length differs by {part:.2g} %, least in {names[low]} and most in {names[high]}"
+    deviation, sides = np.std(own, axis=0), np.ptp(own, axis=0)
+    return f"the principal point moves by {np.hypot(*deviation):.1f} px (rms), over {sides[0]:.0f} × {sides[1]:.0f} px"
+
+
+def px(length: float) -> str:
+    """With two digits at least."""
+    return f"{length:.3f}" if length >= 0.1 else f"{length:.2g}"
 
 
 def _views(found: Calibration) -> Iterator[Finding]:
