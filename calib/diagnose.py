@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.coverage import coverage
+from calib.coverage import cells_of
 from calib.diagnose_changes import OwnCameras, changed_camera
 from calib.refine import Calibration
 from calib.uncertainty import CalibrationCovariance, covariance, uncertainty_map
@@ -26,8 +26,11 @@ _SHARE = 0.1
 """Excess share of the variance that is told: it is a twentieth of the error."""
 _FEW_VIEWS = 8
 _TILT = math.radians(20.0)
-_UNCOVERED = 0.15
-"""Share of the image's border, in cells, beyond what any corner covers that is told."""
+_UNCOVERED, _CELLS = 0.25, 8
+"""Share of the border, in cells, beyond what any corner covers that is told, and cells of its width."""
+_REACH = {True: 1.5, False: 0.5}
+"""Squares from the border that corners can come to: of a board that must be seen whole, and of one with marks."""
+_WHOLE = 0.95
 _VIEW_FACTOR, _VIEW_PX = 2.0, 0.1
 """Times the median error of views, and px, that one is named at."""
 _UNCERTAIN_PX = 1.0
@@ -168,15 +171,44 @@ def _poses(found: Calibration) -> Iterator[Finding]:
             yield Finding(
                 "tilts_about_one_axis", "boards lean one way only", "tilt the board about the other axis, too"
             )
-    covered = coverage(found)
-    border = np.concatenate([covered[0], covered[-1], covered[1:-1, 0], covered[1:-1, -1]])
-    bare = 1 - float(np.mean(border))
+    yield from _border(found)
+
+
+def _border(found: Calibration) -> Iterator[Finding]:
+    """Of the border of what the board can reach: one that must be seen whole keeps its outermost squares within."""
+    margin = _REACH[_is_seen_whole(found)] * _spacing(found)
+    width, height = round(found.camera.width - 2 * margin), round(found.camera.height - 2 * margin)
+    if min(width, height) <= 0:
+        return
+    cells = np.zeros((max(1, round(_CELLS * height / width)), _CELLS), bool)
+    cells.ravel()[cells_of(found.observations.points2D - margin, width, height, _CELLS)] = True
+    bare = 1 - float(np.mean(np.concatenate([cells[0], cells[-1], cells[1:-1, 0], cells[1:-1, -1]])))
     if bare > _UNCOVERED:
+        whole = _is_seen_whole(found)
         yield Finding(
             "uncovered_border",
-            f"{100 * bare:.0f} % of the border of the image has never shown a corner, {_bare_sides(covered)}",
-            "show the board there, close enough to be cut by the border if it has marks",
-        )
+            f"{100 * bare:.0f} % of the border of {'what this board can reach' if whole else 'the image'} has never "
+            f"shown a corner, {_bare_sides(cells)}",
+            "hold the board there, just whole within the image; from farther away it reaches nearer to the border"
+            if whole else "show the board there, close enough to be cut by the border",
+        )  # fmt: skip
+
+
+def _is_seen_whole(found: Calibration) -> bool:
+    """Whether views show all of the board, as they must where no markers tell corners apart."""
+    counts = np.diff(found.observations.offsets)
+    return bool(np.median(counts) >= _WHOLE * len(np.unique(found.observations.rows)))
+
+
+def _spacing(found: Calibration) -> float:
+    """Of corners in the quarter of the views that show them smallest, px."""
+    o, spacings = found.observations, []
+    for v in range(len(o)):
+        points = o.points2D[o.offsets[v] : o.offsets[v + 1]]
+        apart = np.sum((points[:, None] - points[None]) ** 2, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        spacings.append(math.sqrt(float(np.median(apart.min(1)))))
+    return float(np.quantile(spacings, 0.25))
 
 
 def _bare_sides(covered: FloatArray | np.ndarray) -> str:
