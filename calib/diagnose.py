@@ -24,6 +24,8 @@ _CLEAR = 5.0
 """Standard deviations from chance that are told; there are many residuals, and small faults are common."""
 _SHARE = 0.1
 """Excess share of the variance that is told: it is a twentieth of the error."""
+_BEND_PX = 0.01
+"""What a board's shape must add to the error to be told: detection itself shifts corners of flat boards by as much."""
 _FEW_VIEWS = 8
 _TILT = math.radians(20.0)
 _UNCOVERED, _CELLS = 0.25, 8
@@ -221,7 +223,7 @@ def _bare_sides(covered: FloatArray | np.ndarray) -> str:
 def _shape_of_residuals(found: Calibration) -> Iterator[Finding]:
     white = whiteness(found)
     board, image = (share > _SHARE and share > _CLEAR * sigma for share, sigma in (white.board, white.image))
-    if board:
+    if board and math.sqrt(white.board[0]) * found.rms_px > _BEND_PX:
         richer = {"flat": "paraboloid or free", "scale": "paraboloid or free", "free": ""}.get(found.shape.kind, "free")
         yield Finding(
             "bent_board",

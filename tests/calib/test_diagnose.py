@@ -52,6 +52,14 @@ def test_a_bent_board_is_told_and_its_estimated_shape_mends_it(rng):
     assert "bent_board" not in causes(calibrated(views, dataclasses.replace(CONFIG, shape="paraboloid")))
 
 
+def test_of_a_board_that_adds_less_than_detection_errs_nothing_is_told(rng):
+    """Glue mends no shifts of a hundredth of a pixel, which circles and tags of flat boards have, too."""
+    off = 4e-6 * rng.normal(size=(len(BOARD), 1)) * [1.0, 0.5, 0]
+    found = calibrated(seen(LENS, BOARD + off, poses_before(LENS, 40, rng, reach=0.48), rng, 0.01))
+    assert whiteness(found).board[0] > 0.15
+    assert diagnose(found) == ()
+
+
 def test_a_lens_model_that_does_not_fit_is_told(rng):
     found = causes(calibrated(good(rng), dataclasses.replace(CONFIG, lens="simple_radial")))
     assert "lens_model" in found
