@@ -144,7 +144,7 @@ def asymmetric_circle_grid(columns: int, rows: int, row_distance_m: float, diame
 
     `columns` counts the circles of one row, as OpenCV does.
     """
-    return Board("acircles", columns, rows, row_distance_m, diameter_m or row_distance_m * 0.7)
+    return Board("acircles", columns, rows, row_distance_m, diameter_m or round(row_distance_m * 0.7, 9))
 
 
 def _check(board: Board) -> None:

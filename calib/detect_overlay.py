@@ -71,6 +71,9 @@ def _ellipse(canvas: np.ndarray, centre: np.ndarray, covariance: np.ndarray, col
 
 
 def _write(canvas: np.ndarray, text: str, colour: tuple[int, int, int]) -> None:
-    place = (10, canvas.shape[0] - 12)
-    for ink, thickness in (((255, 255, 255), 4), (colour, 1)):
-        cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.6, ink, thickness, cv2.LINE_AA)
+    """On white: letters drawn again, thicker, have other widths and would not lie under the thin ones."""
+    font, size = cv2.FONT_HERSHEY_SIMPLEX, 0.6
+    (width, height), below = cv2.getTextSize(text, font, size, 1)
+    x, y = 10, canvas.shape[0] - 12
+    cv2.rectangle(canvas, (x - 4, y - height - 6), (x + width + 4, y + below + 2), (255, 255, 255), cv2.FILLED)
+    cv2.putText(canvas, text, (x, y), font, size, colour, 1, cv2.LINE_AA)

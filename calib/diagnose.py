@@ -12,7 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.coverage import coverage
+from calib.coverage import cells_of
+from calib.diagnose_changes import OwnCameras, changed_camera
 from calib.refine import Calibration
 from calib.uncertainty import CalibrationCovariance, covariance, uncertainty_map
 from calib.whiteness import whiteness
@@ -23,13 +24,20 @@ _CLEAR = 5.0
 """Standard deviations from chance that are told; there are many residuals, and small faults are common."""
 _SHARE = 0.1
 """Excess share of the variance that is told: it is a twentieth of the error."""
+_BEND_PX = 0.01
+"""What a board's shape must add to the error to be told: detection itself shifts corners of flat boards by as much."""
 _FEW_VIEWS = 8
 _TILT = math.radians(20.0)
-_UNCOVERED = 0.15
-"""Share of the image's border, in cells, beyond what any corner covers that is told."""
+_UNCOVERED, _CELLS = 0.25, 8
+"""Share of the border, in cells, beyond what any corner covers that is told, and cells of its width."""
+_REACH = {True: 1.5, False: 0.5}
+"""Squares from the border that corners can come to: of a board that must be seen whole, and of one with marks."""
+_WHOLE = 0.95
 _VIEW_FACTOR, _VIEW_PX = 2.0, 0.1
 """Times the median error of views, and px, that one is named at."""
 _UNCERTAIN_PX = 1.0
+_NAMED = 12
+"""Photos that a finding names."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -48,13 +56,20 @@ def board_tilts(found: Calibration) -> tuple[Vector, Vector]:
     return np.arccos(np.clip(normals[:, 2], -1, 1)), np.arctan2(normals[:, 1], normals[:, 0])
 
 
-def diagnose(found: Calibration, doubts: CalibrationCovariance | Rejected | None = None) -> tuple[Finding, ...]:
+def diagnose(
+    found: Calibration, doubts: CalibrationCovariance | Rejected | None = None, *, is_explained: bool = False
+) -> tuple[Finding, ...]:
     """What is wrong, the gravest first; nothing where nothing was found.
 
     Args:
         doubts: how uncertain it is; by default by views, or its lower bound where these are too few.
+        is_explained: a cause is known already for which photos disagree, as that some are turned.
     """
-    told = (finding for part in (_solution, _views, _poses, _shape_of_residuals) for finding in part(found))
+    changed = None if is_explained else changed_camera(found)
+    parts = (_views, _poses) if is_explained or changed else (_views, _poses, _shape_of_residuals)
+    told = [*_solution(found), *_changes(changed), *(finding for part in parts for finding in part(found))]
+    if changed:  # what is a single photo's fault cannot be told from what is its own camera's
+        told = [finding for finding in told if finding.cause != "outlier_view"]
     return (*told, *_reach(found, _doubts(found) if doubts is None else doubts))
 
 
@@ -81,6 +96,47 @@ def _solution(found: Calibration) -> Iterator[Finding]:
             f"{math.degrees(worst):.0f}°",
             "show the board in the corners of the image, or take a lens model with fewer coefficients",
         )
+
+
+def _changes(changed: OwnCameras | None) -> Iterator[Finding]:
+    if changed is None:
+        return
+    falls = f"the error falls from {px(changed.rms_px)} to {px(changed.own_rms_px)} px"
+    if changed.kind == "focal":
+        yield Finding(
+            "changed_focus",
+            f"{_by_how_much(changed)}; with a focal length of its own for each photo {falls}",
+            "hold focus and zoom (no autofocus, rings taped) and take the photos anew, or calibrate from those of one "
+            "setting alone",
+        )
+    else:
+        yield Finding(
+            "moved_principal_point",
+            f"{_by_how_much(changed)}; with a principal point of its own for each photo {falls}",
+            "switch stabilisers of lens and sensor off, leave photos uncropped, and take them anew",
+        )
+
+
+def _by_how_much(changed: OwnCameras) -> str:
+    names, own = changed.names, changed.own
+    if changed.apart:
+        few = list(changed.apart)
+        told = ", ".join(names[v] for v in few[:_NAMED]) + (f" and {len(few) - _NAMED} more" if few[_NAMED:] else "")
+        off = own[few].mean(0) - np.delete(own, few, axis=0).mean(0)
+        if changed.kind == "focal":
+            return f"{told}: the focal length is {100 * math.expm1(off[0]):+.2g} % off that of the other photos"
+        return f"{told}: the principal point is ({off[0]:+.1f}, {off[1]:+.1f}) px off that of the other photos"
+    if changed.kind == "focal":
+        low, high = int(np.argmin(own[:, 0])), int(np.argmax(own[:, 0]))
+        part = 100 * math.expm1(own[high, 0] - own[low, 0])
+        return f"the focal length differs by {part:.2g} %, least in {names[low]} and most in {names[high]}"
+    deviation, sides = np.std(own, axis=0), np.ptp(own, axis=0)
+    return f"the principal point moves by {np.hypot(*deviation):.1f} px (rms), over {sides[0]:.0f} × {sides[1]:.0f} px"
+
+
+def px(length: float) -> str:
+    """With two digits at least."""
+    return f"{length:.3f}" if length >= 0.1 else f"{length:.2g}"
 
 
 def _views(found: Calibration) -> Iterator[Finding]:
@@ -117,15 +173,44 @@ def _poses(found: Calibration) -> Iterator[Finding]:
             yield Finding(
                 "tilts_about_one_axis", "boards lean one way only", "tilt the board about the other axis, too"
             )
-    covered = coverage(found)
-    border = np.concatenate([covered[0], covered[-1], covered[1:-1, 0], covered[1:-1, -1]])
-    bare = 1 - float(np.mean(border))
+    yield from _border(found)
+
+
+def _border(found: Calibration) -> Iterator[Finding]:
+    """Of the border of what the board can reach: one that must be seen whole keeps its outermost squares within."""
+    margin = _REACH[_is_seen_whole(found)] * _spacing(found)
+    width, height = round(found.camera.width - 2 * margin), round(found.camera.height - 2 * margin)
+    if min(width, height) <= 0:
+        return
+    cells = np.zeros((max(1, round(_CELLS * height / width)), _CELLS), bool)
+    cells.ravel()[cells_of(found.observations.points2D - margin, width, height, _CELLS)] = True
+    bare = 1 - float(np.mean(np.concatenate([cells[0], cells[-1], cells[1:-1, 0], cells[1:-1, -1]])))
     if bare > _UNCOVERED:
+        whole = _is_seen_whole(found)
         yield Finding(
             "uncovered_border",
-            f"{100 * bare:.0f} % of the border of the image has never shown a corner, {_bare_sides(covered)}",
-            "show the board there, close enough to be cut by the border if it has marks",
-        )
+            f"{100 * bare:.0f} % of the border of {'what this board can reach' if whole else 'the image'} has never "
+            f"shown a corner, {_bare_sides(cells)}",
+            "hold the board there, just whole within the image; from farther away it reaches nearer to the border"
+            if whole else "show the board there, close enough to be cut by the border",
+        )  # fmt: skip
+
+
+def _is_seen_whole(found: Calibration) -> bool:
+    """Whether views show all of the board, as they must where no markers tell corners apart."""
+    counts = np.diff(found.observations.offsets)
+    return bool(np.median(counts) >= _WHOLE * len(np.unique(found.observations.rows)))
+
+
+def _spacing(found: Calibration) -> float:
+    """Of corners in the quarter of the views that show them smallest, px."""
+    o, spacings = found.observations, []
+    for v in range(len(o)):
+        points = o.points2D[o.offsets[v] : o.offsets[v + 1]]
+        apart = np.sum((points[:, None] - points[None]) ** 2, axis=2)
+        np.fill_diagonal(apart, np.inf)
+        spacings.append(math.sqrt(float(np.median(apart.min(1)))))
+    return float(np.quantile(spacings, 0.25))
 
 
 def _bare_sides(covered: FloatArray | np.ndarray) -> str:
@@ -138,7 +223,7 @@ def _bare_sides(covered: FloatArray | np.ndarray) -> str:
 def _shape_of_residuals(found: Calibration) -> Iterator[Finding]:
     white = whiteness(found)
     board, image = (share > _SHARE and share > _CLEAR * sigma for share, sigma in (white.board, white.image))
-    if board:
+    if board and math.sqrt(white.board[0]) * found.rms_px > _BEND_PX:
         richer = {"flat": "paraboloid or free", "scale": "paraboloid or free", "free": ""}.get(found.shape.kind, "free")
         yield Finding(
             "bent_board",

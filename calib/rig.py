@@ -83,7 +83,7 @@ def calibrate_rig(
         list(one.calibration.rejected_corners) if one.calibration else [] for one in alone
     ]
     if config.reject:
-        rejected = reject_from_rig(fit, system, summary, views, corners)
+        rejected = reject_from_rig(fit, system, summary, views, corners, estimate)
         if isinstance(rejected, Rejected):
             return rejected
         system, summary = rejected

@@ -71,12 +71,15 @@ class RigFit(Value):
 
 def reject_from_rig(
     fit: RigFit, system: RigSystem, summary: Summary, views: Sequence[list[RejectedView]],
-    corners: Sequence[list[tuple[str, int]]],
+    corners: Sequence[list[tuple[str, int]]], start: RigEstimate | None = None,
 ) -> tuple[RigSystem, Summary] | Rejected:  # fmt: skip
     """Refits without corners beyond some σ, and without views far worse than the others; appends them, by camera.
 
     Corners may come back: all are judged again by each new fit, until the choice stays.
 
+    Args:
+        start: where `system` was solved from. First poses are those on which most frames agree; a few frames of two
+            moments bend least squares so far that nothing fits, and no robust fit comes back from there.
     Returns:
         `nothing_fits` where no two views of a frame are left.
     """
@@ -85,8 +88,7 @@ def reject_from_rig(
     if not any(np.any(one > limit) for one, limit in zip(lengths, limits, strict=True)):
         return system, summary
     # Least squares bends towards what is wrong; which corners that are, a robust fit tells.
-    judge = fit.system(full, system.estimate, "cauchy", 2 * sigma)
-    minimize(judge, ROBUST)
+    judge = _robust(fit, full, [system.estimate] if start is None else [system.estimate, start], 2 * sigma)
     before: list[np.ndarray] | None = None
     for _ in range(_ROUNDS):
         lengths = judge.whitened_lengths()
@@ -112,6 +114,13 @@ def reject_from_rig(
         names, view_of = full.cameras[c].names, full.cameras[c].view_of
         corners[c].extend((names[view_of[n]], int(full.cameras[c].rows[n])) for n in np.flatnonzero(~mask))
     return system, summary
+
+
+def _robust(fit: RigFit, observations: RigObservations, starts: Sequence[RigEstimate], scale: float) -> RigSystem:
+    """The best of the robust fits from these starts."""
+    judges = [fit.system(observations, start, "cauchy", scale) for start in starts]
+    costs = [minimize(judge, ROBUST).final_cost for judge in judges]
+    return judges[int(np.argmin(costs))]
 
 
 def _of_views(observations: RigObservations, camera: int, mask: np.ndarray, kept: Sequence[int]) -> np.ndarray:

@@ -4,7 +4,9 @@ With the board turned along, such a photo is as good as any, and the only sign o
 lies on the other side of the middle of the image, and what is not symmetric of the distortion has the other sign. So
 the choice of photos that are turned is one of signs, as that of boards' ends, and found in the same way
 (`refine_ends`): about the solution with a camera that is symmetric, again with those that were found turned back,
-until no more are found. It is believed if the errors are then clearly smaller.
+until no more are found. It is believed if the errors are then clearly smaller, and if it explains them: where photos
+that are turned back still want a camera each, it is the camera that changed (see `diagnose_changes`), as by zooming,
+and turning some of them has only made up for a part of that.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.diagnose_changes import changed_camera
 from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_ends import Quadratics, most_likely_turns
 from calib.refine_system import CalibrationSystem, Estimate
@@ -58,7 +61,7 @@ def turned_photos(board: Points3D, views: Sequence[BoardView], config: Calibrati
         turned ^= {found.observations.names[v] for v in np.flatnonzero(against)}
     else:
         return None
-    if not turned or not errors[-1] < _CLEARLY * errors[0]:
+    if not turned or not errors[-1] < _CLEARLY * errors[0] or changed_camera(found) is not None:
         return None
     names = tuple(view.name for view in views if view.name in turned)
     return TurnedPhotos(names, errors[0], errors[-1])

@@ -70,7 +70,9 @@ def what_it_brings(name: str, errors_px: tuple[float, float], but: str, needs: s
         but: why it was not taken; needs: what it takes; option: of the command, that takes it nevertheless.
     """
     was, would_be = errors_px
+    apart = abs(was - would_be)
+    digits = min(max(3, 1 - math.floor(math.log10(apart))), 6) if 0 < apart < math.inf else 3
     return (
-        f"{name} would bring the error of photos held out from {was:.3f} to {would_be:.3f} px, but {but}: "
-        f"it needs {needs}, or {option}"
+        f"{name} would bring the error of photos held out from {was:.{digits}f} to {would_be:.{digits}f} px, "
+        f"but {but}: it needs {needs}, or {option}"
     )

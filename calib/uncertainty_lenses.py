@@ -150,7 +150,7 @@ def _judged(
     row = dataclasses.replace(row, excess=float(np.mean(excess)), excess_error=error)
     if row.lens == chosen.lens or not is_clearly_lower(held.squares, held_chosen.squares, _CLEAR):
         return row
-    told = f"that is {row.ratio:.2f} times its error on the photos it was fitted to"
+    told = f"that is {row.ratio:.3f} times its error on the photos it was fitted to"
     why = told, photos_needed(len(excess), row.ratio)
     if not row.converged:
         why = "it does not converge", "more photos"

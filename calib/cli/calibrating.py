@@ -202,7 +202,8 @@ def _findings(
     alike = [view for view in seen.views if (view.width, view.height) == (found.camera.width, found.camera.height)]
     system, _ = fit_poses(found.camera, found.shape, gather(seen.points3D, alike))
     window = window_finding(system.observations, system.residuals())
-    return (*_turned(seen, config), *filter(None, [window]), *diagnose(found, doubts))
+    turned = tuple(_turned(seen, config))
+    return (*turned, *filter(None, [window]), *diagnose(found, doubts, is_explained=bool(turned)))
 
 
 def _turned(seen: Sightings, config: CalibrationConfig) -> Iterator[Finding]:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -128,12 +128,20 @@ def _write_overlays(
     from sfm.io.atomic import write_bytes
     from sfm.io.images import read_image
 
+    drawn_as = _overlay_names(seen)
     for name, detection in seen.items():
         if isinstance(detection, Rejected) and detection.reason == "unreadable":
             continue
         drawn = overlay(read_image(photos[name]), board, detection)
         _, data = cv2.imencode(".png", cv2.cvtColor(drawn, cv2.COLOR_RGB2BGR))
-        write_bytes(folder / f"{name}.png", data.tobytes())
+        write_bytes(folder / drawn_as[name], data.tobytes())
+
+
+def _overlay_names(names: Iterable[str]) -> dict[str, str]:
+    """The photo's name with .png as suffix; where photos differ by their suffix alone it is added to the whole name."""
+    shared = Counter(str(Path(name).with_suffix("")).lower() for name in names)
+    alone = {name: shared[str(Path(name).with_suffix("")).lower()] == 1 for name in names}
+    return {name: str(Path(name).with_suffix(".png")) if alone[name] else f"{name}.png" for name in names}
 
 
 def _summary(board: Board, seen: Mapping[str, Detection | Rejected]) -> dict[str, object]:

@@ -185,3 +185,8 @@ def test_corners_of_the_artwork_are_the_boards_up_to_its_frame(board):
     page = lay_out(board)
     assert page.left_m >= PAGE_MARGIN_M - 1e-9
     assert page.top_m + drawn.height_m <= page.height_m - PAGE_MARGIN_M - FOOTER_M + 1e-9
+
+
+def test_lengths_that_are_left_to_the_board_are_written_as_a_person_would(tmp_path):
+    text = board_toml(asymmetric_circle_grid(4, 11, 0.02))
+    assert "diameter_m = 0.014\n" in text

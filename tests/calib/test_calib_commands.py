@@ -11,6 +11,7 @@ import pytest
 import calib
 from calib.boards import charuco
 from calib.cli import main
+from calib.cli.detect import _overlay_names
 from calib.cli.photos import detect_photos, detection_from_json, detection_json, detector_sources, find_photos
 from calib.detect import Detection
 from sfm.core.errors import ExitCode, InputError, Rejected
@@ -119,7 +120,7 @@ def test_a_board_is_drawn_and_found_by_the_commands(sfm, tmp_path, photos):
     assert summary["images"]["a2.png"]["corners"] == 20
     assert summary["images"]["torn.png"]["reason"] == "unreadable"
     assert len(json.loads((tmp_path / "corners.json").read_text())["images"]["a2.png"]["points2D"]) == 20
-    assert cv2.imread(str(tmp_path / "seen" / "a2.png.png")) is not None
+    assert cv2.imread(str(tmp_path / "seen" / "a2.png")) is not None
 
 
 @pytest.mark.parametrize(
@@ -149,7 +150,12 @@ def test_what_is_drawn_never_lies_among_the_photos(photos, tmp_path, capsys):
     assert set(find_photos([tmp_path / "photos"])) == set(photos)
     outside = str(tmp_path / "drawn")
     assert main(["detect", folder, "--board", BOARD.spec, "--no-cache", "--overlays", outside]) == ExitCode.OK
-    assert (tmp_path / "drawn" / "a2.png.png").is_file()
+    assert (tmp_path / "drawn" / "a2.png").is_file()
+
+
+def test_drawings_are_named_as_their_photos_and_none_twice():
+    named = _overlay_names(["a.png", "b.jpg", "left/b.png", "c.d.tif", "e.jpg", "e.png"])
+    assert list(named.values()) == ["a.png", "b.png", "left/b.png", "c.d.png", "e.jpg.png", "e.png.png"]
 
 
 def test_corners_are_written_as_json_or_not_at_all(photos, tmp_path, capsys):

@@ -53,3 +53,9 @@ def test_the_sentence_says_what_it_brings_and_what_it_takes():
         "a free board shape would bring the error of photos held out from 0.171 to 0.078 px, but it does not hold: "
         "it needs more photos, or --shape free"
     )
+
+
+def test_errors_that_differ_are_told_by_digits_that_differ():
+    told = what_it_brings("fisheye", (0.01914, 0.01868), "it does not hold", "more photos", "--model fisheye")
+    assert "from 0.01914 to 0.01868 px" in told
+    assert "from 0.171 to 0.078 px" in what_it_brings("fisheye", (0.1714, 0.0779), "it does not", "more", "--model f")
