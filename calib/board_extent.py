@@ -130,8 +130,9 @@ def _of_circles(grey: UInt8[np.ndarray, "H W"], board: Board, seen: BoardView) -
     contrast = (outside - inside).reshape(column.shape)
     within = slice(_BEYOND, -_BEYOND)
     usual = float(np.nanmedian(contrast[within, within]))
-    if not usual > 0:
+    if not usual:
         return None
+    contrast, usual = contrast * np.sign(usual), abs(usual)  # light circles on black as well
     sizes = [columns, rows]
     for axis, grid in enumerate((contrast.T, contrast)):
         for lines in (grid[:_BEYOND][::-1], grid[-_BEYOND:]):

@@ -42,8 +42,9 @@ _MARGIN = 0.2
 
 def fit_circles(
     grey: UInt8[np.ndarray, "H W"], points2D: Points2D, affines: Affines, board: Board, noise: float
-) -> tuple[Points2D, Float64[np.ndarray, "N 2 2"]]:
-    """Centroids of the dark ellipses near `points2D` and their covariances in px²; NaN where there is none.
+) -> tuple[Points2D, Float64[np.ndarray, "N 2 2"], Float64[np.ndarray, " N"]]:
+    """Centroids of the dark ellipses near `points2D`, their covariances in px² and what their areas are by those of
+    circles on the board; NaN where there is none.
 
     Args:
         affines: of the map from board to image at the circles.
@@ -51,11 +52,12 @@ def fit_circles(
     """
     radius = board.detail_m / 2 + _MARGIN * (board.clear_radius_m - board.detail_m / 2)
     centres, covariances = np.full_like(points2D, np.nan), np.full((len(points2D), 2, 2), np.nan)
+    areas = np.full(len(points2D), np.nan)
     for i, (point, affine) in enumerate(zip(points2D, affines, strict=True)):
         fitted = _centroid(grey, point, affine * radius, noise)
         if fitted is not None:
-            centres[i], covariances[i] = fitted
-    return centres, covariances
+            centres[i], covariances[i], areas[i] = fitted
+    return centres, covariances, areas / (np.pi * (board.detail_m / 2) ** 2 * np.abs(np.linalg.det(affines)))
 
 
 def with_dark_circles(
@@ -113,8 +115,8 @@ def shifts_by_one_lens(centres: Points2D, board_points: Points2D, radius_m: floa
 
 def _centroid(
     grey: UInt8[np.ndarray, "H W"], point: np.ndarray, semi_axes: np.ndarray, noise: float
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Centroid of the darkness in an ellipse that follows it, and its covariance."""
+) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Centroid of the darkness in an ellipse that follows it, its covariance, and the darkness in px²."""
     centre, inverse = point, np.linalg.inv(semi_axes)
     reach = np.linalg.norm(semi_axes, axis=1)
     weight = offset = slope = np.empty(0)
@@ -139,4 +141,5 @@ def _centroid(
         if np.abs(step).max() < 1e-4:
             break
     spread = (offset * slope[:, None]) / weight.sum()
-    return centre, (noise**2 + _ROUNDING_VARIANCE) * spread.T @ spread + _SAMPLING_PX**2 * np.eye(2)
+    covariance = (noise**2 + _ROUNDING_VARIANCE) * spread.T @ spread + _SAMPLING_PX**2 * np.eye(2)
+    return centre, covariance, float(weight.sum())

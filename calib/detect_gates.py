@@ -26,6 +26,9 @@ _FEW = 48
 """Corners up to which each pulls the predictions of all others towards itself."""
 _SUSPECTS = 8
 
+_ODD_AREA = 0.2
+"""Of the median by what the board says: circles that are partly covered are off by less than neighbours can tell."""
+
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class DetectConfig:
@@ -246,12 +249,15 @@ def fitted_circles(
     """Centres of circles near `points2D`, with a verdict on each."""
     noise = 255 * noise_sigma(np.ascontiguousarray(grey))
     grey = with_dark_circles(grey, points2D, affines, board)
-    centroids, covariances = fit_circles(grey, points2D, affines, board, noise)
+    centroids, covariances, areas = fit_circles(grey, points2D, affines, board, noise)
     nothing = np.full(len(ids), np.nan)
     corners = Corners(ids, points2D, centroids, covariances, np.full((len(ids), 11), np.nan), nothing)
     corners.reject(np.isnan(centroids[:, 0]), "cut off, or no circle")
+    if not corners.kept.any():
+        return corners
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * board.pitch_m
     corners.reject(np.linalg.norm(centroids - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0), "jumped")
+    corners.reject(np.abs(areas / np.nanmedian(areas) - 1) > _ODD_AREA, "not the size of a circle")
     _judge_places(board, corners, config)
     kept = corners.kept
     if kept.sum() >= 4:

@@ -84,3 +84,14 @@ def test_photos_of_a_perforated_wall_are_refused():
     y, x = np.mgrid[:480, :640] % 16 - 8
     photo[y * y + x * x < 20] = 40
     assert isinstance(detect_board(photo, SHIFTED), Rejected)
+
+
+@pytest.mark.parametrize("board", [SQUARE, SHIFTED], ids=lambda board: board.kind)
+def test_a_circle_that_is_partly_covered_is_left_out_and_no_other(board):
+    photo, truth = views.render(board, views.PINHOLE, views.pose(board, 0.30, 25, 30, 10))
+    x, y = np.rint(truth[17]).astype(int)
+    photo[y + 4 : y + 14, x - 12 : x + 13] = 190  # a finger on its lower third
+    found = detect_board(photo, board)
+    assert isinstance(found, Detection)
+    assert list(found.rejected) == [17]
+    assert np.linalg.norm(found.points2D - truth[found.corner_ids], axis=1).max() < 0.2
