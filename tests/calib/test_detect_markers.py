@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
 from calib.boards import aprilgrid, charuco
 from calib.detect import Detection, detect_board
+from calib.detect_gates import DetectConfig, fitted_crossings
+from calib.detect_neighbours import local_affines
 from calib.detect_print import resemblances
 from datasets.synthetic import boards as views
 from sfm.core.cameras import Camera
@@ -50,18 +51,20 @@ def test_what_is_printed_around_a_corner_is_told_from_what_is_not(plain):
     assert np.delete(found, off).min() > 0.6
 
 
-def test_a_crossing_that_an_object_makes_is_no_corner(plain):
-    photo, truth = plain
-    spoilt = photo.copy()
-    hidden = 7
-    x, y = np.rint(truth[hidden]).astype(int)
-    cv2.rectangle(spoilt, (x - 26, y - 26), (x + 26, y + 26), 140, -1)
-    cv2.rectangle(spoilt, (x - 18, y - 12), (x + 6, y + 8), 26, -1)
-    cv2.rectangle(spoilt, (x + 6, y + 8), (x + 26, y + 26), 26, -1)
-    seen = detect_board(spoilt, CHARUCO)
-    assert isinstance(seen, Detection)
-    assert np.abs(seen.points2D - truth[seen.corner_ids]).max() < 1
-    assert len(seen.corner_ids) >= len(truth) - 4
+@pytest.mark.parametrize("moved_px", [(12, 7), (-10, 14)])
+def test_a_crossing_beside_its_place_is_no_corner_where_few_others_are_seen(moved_px):
+    board = charuco(5, 7, 0.03, 0.02, "DICT_4X4_50")
+    photo, truth = views.render(board, views.DISTORTED, views.pose(board, 0.14, 30, 60, 20, shift=(0, -0.02)))
+    ids = np.array([10, 12, 13, 14, 16, 17, 20, 21])
+    sought, spoilt = truth[ids], photo.copy()
+    sought[-1] += moved_px
+    x, y = np.rint(truth[21]).astype(int)
+    (u, v), patch = (x + moved_px[0], y + moved_px[1]), photo[y - 20 : y + 20, x - 20 : x + 20]
+    spoilt[v - 20 : v + 20, u - 20 : u + 20] = patch
+    affines = local_affines(board.points3D[ids, :2], sought)
+    assert list(fitted_crossings(spoilt, board, ids, sought, affines, DetectConfig()).reasons) == [21]
+    affines = local_affines(board.points3D[ids, :2], truth[ids])
+    assert not fitted_crossings(photo, board, ids, truth[ids], affines, DetectConfig()).reasons
 
 
 def test_markers_that_are_white_on_black_are_read(plain):
