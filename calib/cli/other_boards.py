@@ -18,7 +18,7 @@ from sfm.io.images import read_image
 
 _PHOTOS = 2
 _PATIENCE_S = 15.0
-"""Finders take seconds where there is nothing to be found."""
+"""Of work, whatever else the machine does: finders take seconds where there is nothing to be found."""
 _MOSTLY = 0.6
 """Part of the corners of another board that must be seen."""
 _STEPS = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1))
@@ -26,14 +26,14 @@ _STEPS = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1))
 
 def board_that_is_shown(photos: Mapping[str, Path], board: Board) -> Board | None:
     """Another board that some of the first photos show, None where they show none of those that were tried."""
-    began = time.monotonic()
+    began = time.thread_time()
     for path in list(photos.values())[:_PHOTOS]:
         try:
             grey = read_image(path, gray=True)
         except ImageError:
             continue
         for other in _similar(board):
-            if time.monotonic() - began > _PATIENCE_S:
+            if time.thread_time() - began > _PATIENCE_S:
                 return None
             seen = detect_board(grey, other)
             if isinstance(seen, Detection) and len(seen.corner_ids) >= _MOSTLY * len(other.points3D):

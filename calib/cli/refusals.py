@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from calib.board_extent import size_that_is_shown
+from calib.boards import Board
+from calib.cli.marker_refusals import marker_words, shown_marker_size
 from calib.cli.other_boards import board_that_is_shown
 from calib.cli.photos import find_photos, photos_of
 from calib.cli.sightings import Sightings
@@ -76,10 +78,12 @@ def shown_size_of_all(seen: Mapping[str, Sightings], sources: Mapping[str, Seque
         InputError: that is certain.
     """
     board = next((one.board for one in seen.values()), None)
-    if board is None or board.has_markers or any(one.kind != "photos" for one in seen.values()):
+    if board is None or any(one.kind != "photos" for one in seen.values()):
         return None
     each = max(_FEWEST_LOOKED_AT, _LOOKED_AT // len(seen))
     looked_at = [pair for name, one in seen.items() for pair in _some_photos(one, sources[name], each)]
+    if board.has_markers:
+        return _other_markers(board, looked_at)
     shown = size_that_is_shown(board, looked_at)
     if shown is None:
         return None
@@ -91,6 +95,20 @@ def shown_size_of_all(seen: Mapping[str, Sightings], sources: Mapping[str, Seque
         raise InputError(told, path=folders[0] if len(folders) == 1 else None, remedy=f"try --board {other.spec}")
     return Finding(
         "other_board", told, f"look at the corners with `calib detect --overlays`, or try --board {other.spec}"
+    )
+
+
+def _other_markers(board: Board, photos: Sequence[tuple[ImageU8, BoardView]]) -> Finding | None:
+    side = shown_marker_size(board, photos)
+    if side is None:
+        return None
+    length, count = side
+    other = dataclasses.replace(board, detail_m=round(length, 4))
+    return Finding(
+        "other_board",
+        f"{count} photos show markers of {1000 * length:.1f} mm, you named {1000 * board.detail_m:g} mm: corners are "
+        "lost by it",
+        f"measure them by the squares of {1000 * board.pitch_m:g} mm, and try --board {other.spec}",
     )
 
 
@@ -120,7 +138,10 @@ def _check_the_board(seen: Sightings, sources: Sequence[Path]) -> str:
     """What the photos show, if it is nearly what was named."""
     if seen.board is not None and seen.kind == "photos":
         print("looking whether the photos show another board", file=sys.stderr)
-        other = board_that_is_shown(find_photos(sources), seen.board)
+        photos = find_photos(sources)
+        if seen.board.has_markers and (told := marker_words(list(photos.values()), seen.board)):
+            return told
+        other = board_that_is_shown(photos, seen.board)
         if other is not None:
             own, named = (f"{board.columns}x{board.rows}" for board in (other, seen.board))
             counted = COUNTED[other.kind]
