@@ -22,8 +22,8 @@ from sfm.core.imaging.noise import noise_sigma
 
 _LEAST_FOR_LENS = 6
 """Corners without which a plane before a lens, of nine parameters, fits anything."""
-_FEW = 48
-"""Corners up to which each pulls the predictions of all others towards itself."""
+_FEW = 150
+"""Corners up to which there is time to leave each out of the prediction of the others."""
 _SUSPECTS = 8
 
 _ODD_AREA = 0.2

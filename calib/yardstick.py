@@ -23,7 +23,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from calib.diagnose import coverage
+from calib.coverage import coverage
 from calib.refine import Calibration, CalibrationConfig, calibrate
 from calib.refine_board import BoardShape, ShapeKind, board_shape
 from calib.refine_system import CalibrationSystem
