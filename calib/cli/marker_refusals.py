@@ -25,7 +25,7 @@ _SIZES = (50, 100, 250, 1000)
 _OTHERS = ("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5")
 _DIFFERS = 0.1
 """Part of a marker's side; as measured it is right to 2 %."""
-_LEAST_CORNERS = 6
+_LEAST_CORNERS, _ENOUGH = 6, 8
 
 
 def marker_words(photos: Sequence[Path], board: Board) -> str:
@@ -68,6 +68,25 @@ def shown_marker_size(board: Board, photos: Sequence[tuple[ImageU8, BoardView]])
     agree = int(np.sum(np.abs(np.array(measured) - side) < 0.5 * _DIFFERS * side))
     differs = abs(side / board.detail_m - 1) > _DIFFERS and 2 * agree > len(measured)
     return (side, agree) if differs else None
+
+
+def unseen_line(board: Board, views: Sequence[BoardView]) -> Board | None:
+    """The ChArUco board without its last row or column, where no photo shows a corner of that but many of the next."""
+    if board.kind != "charuco" or len(views) < _ENOUGH:
+        return None
+    across, down = board.grid
+    lines = {
+        "rows": (down, [view.corner_ids // across for view in views]),
+        "columns": (across, [view.corner_ids % across for view in views]),
+    }
+    for what, (count, seen) in lines.items():
+        unseen = not any(np.any(line == count - 1) for line in seen)
+        if unseen and 2 * sum(bool(np.any(line == count - 2)) for line in seen) > len(views):
+            try:
+                return dataclasses.replace(board, **{what: getattr(board, what) - 1})
+            except ValueError:
+                return None
+    return None
 
 
 def _read(grey: np.ndarray, board: Board, dictionary: str) -> tuple[np.ndarray, list[FloatArray]]:

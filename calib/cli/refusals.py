@@ -10,7 +10,7 @@ from pathlib import Path
 
 from calib.board_extent import size_that_is_shown
 from calib.boards import Board
-from calib.cli.marker_refusals import marker_words, shown_marker_size
+from calib.cli.marker_refusals import marker_words, shown_marker_size, unseen_line
 from calib.cli.other_boards import board_that_is_shown
 from calib.cli.photos import find_photos, photos_of
 from calib.cli.sightings import Sightings
@@ -83,7 +83,7 @@ def shown_size_of_all(seen: Mapping[str, Sightings], sources: Mapping[str, Seque
     each = max(_FEWEST_LOOKED_AT, _LOOKED_AT // len(seen))
     looked_at = [pair for name, one in seen.items() for pair in _some_photos(one, sources[name], each)]
     if board.has_markers:
-        return _other_markers(board, looked_at)
+        return _other_markers(board, looked_at) or _unseen_line(board, [v for one in seen.values() for v in one.views])
     shown = size_that_is_shown(board, looked_at)
     if shown is None:
         return None
@@ -109,6 +109,18 @@ def _other_markers(board: Board, photos: Sequence[tuple[ImageU8, BoardView]]) ->
         f"{count} photos show markers of {1000 * length:.1f} mm, you named {1000 * board.detail_m:g} mm: corners are "
         "lost by it",
         f"measure them by the squares of {1000 * board.pitch_m:g} mm, and try --board {other.spec}",
+    )
+
+
+def _unseen_line(board: Board, views: Sequence[BoardView]) -> Finding | None:
+    other = unseen_line(board, views)
+    if other is None:
+        return None
+    line = "row" if other.rows < board.rows else "column"
+    return Finding(
+        "other_board",
+        f"no photo shows a corner of the last {line} of squares, though most show those next to it",
+        f"count the squares ({board.columns}x{board.rows} were named), and try --board {other.spec}",
     )
 
 

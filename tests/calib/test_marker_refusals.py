@@ -71,3 +71,20 @@ def test_markers_of_another_size_are_told(tmp_path):
     assert "3 photos show markers of 2" in finding.detail
     assert "you named 15 mm" in finding.detail
     assert shown_size(dataclasses.replace(seen, board=SHOWN), [tmp_path]) is None
+
+
+@pytest.mark.parametrize(("columns", "rows", "line"), [(7, 6, "row"), (8, 5, "column")])
+def test_a_line_that_no_photo_shows_is_told(columns, rows, line, tmp_path):
+    named = charuco(columns, rows, 0.03, 0.022)
+    across = columns - 1
+    ids = np.array([r * across + c for r in range(4) for c in range(6)])
+    pixels = np.stack([ids % across, ids // across], 1) * 40.0 + 100
+    views = tuple(BoardView(f"{k}.png", 640, 480, ids, pixels) for k in range(9))
+    finding = shown_size(Sightings(named, named.points3D, views, (), ""), [tmp_path])
+    assert finding is not None
+    assert f"the last {line} of squares" in finding.detail
+    assert finding.remedy.endswith(f"--board {SHOWN.spec}")
+    right = Sightings(
+        SHOWN, SHOWN.points3D, tuple(dataclasses.replace(v, corner_ids=np.arange(24)) for v in views), (), ""
+    )
+    assert shown_size(right, [tmp_path]) is None
