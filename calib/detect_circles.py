@@ -43,8 +43,8 @@ _MARGIN = 0.2
 def fit_circles(
     grey: UInt8[np.ndarray, "H W"], points2D: Points2D, affines: Affines, board: Board, noise: float
 ) -> tuple[Points2D, Float64[np.ndarray, "N 2 2"], Float64[np.ndarray, " N"]]:
-    """Centroids of the dark ellipses near `points2D`, their covariances in px² and what their areas are by those of
-    circles on the board; NaN where there is none.
+    """Centroids of the dark ellipses near `points2D`, their covariances and their areas in px²; NaN where there is
+    none.
 
     Args:
         affines: of the map from board to image at the circles.
@@ -57,7 +57,7 @@ def fit_circles(
         fitted = _centroid(grey, point, affine * radius, noise)
         if fitted is not None:
             centres[i], covariances[i], areas[i] = fitted
-    return centres, covariances, areas / (np.pi * (board.detail_m / 2) ** 2 * np.abs(np.linalg.det(affines)))
+    return centres, covariances, areas
 
 
 def with_dark_circles(
@@ -84,13 +84,31 @@ def centroid_shifts(image: ImageOfBoard, board_points: Points2D, radius_m: float
     Discs are polygons of `_RIM_POINTS` corners with the discs' moments of inertia by their areas, so that centroids are
     those of the discs up to the fourth order.
     """
+    rims = _rims(image, board_points, radius_m)
+    after, areas = np.roll(rims, -1, axis=1), _doubled_areas(rims)
+    return ((rims + after) * areas[..., None]).sum(axis=1) / (3 * areas.sum(axis=1))[:, None]
+
+
+def areas_by_one_lens(
+    points2D: Points2D, board_points: Points2D, radius_m: float, size: tuple[int, int]
+) -> Float64[np.ndarray, " N"]:
+    """Areas of the discs' images in px², by the lens with one coefficient that fits them best."""
+    rims = _rims(fit_plane_closely(board_points, points2D, size).image, board_points, radius_m)
+    return np.abs(_doubled_areas(rims).sum(axis=1)) / 2
+
+
+def _rims(image: ImageOfBoard, board_points: Points2D, radius_m: float) -> np.ndarray:
+    """Corners (N, `_RIM_POINTS`, 2) of the polygons in the image, from the images of the centres."""
     step = 2 * np.pi / _RIM_POINTS
     around, reach_m = step * np.arange(_RIM_POINTS), radius_m * np.sqrt(3 / (2 + np.cos(step)))
     rims = board_points[:, None] + reach_m * np.stack([np.cos(around), np.sin(around)], axis=1)
-    rims = image(rims.reshape(-1, 2)).reshape(*rims.shape) - image(board_points)[:, None]
+    return image(rims.reshape(-1, 2)).reshape(*rims.shape) - image(board_points)[:, None]
+
+
+def _doubled_areas(rims: np.ndarray) -> np.ndarray:
+    """Twice the signed areas of the triangles of each edge with the centre."""
     after = np.roll(rims, -1, axis=1)
-    doubled_areas = rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
-    return ((rims + after) * doubled_areas[..., None]).sum(axis=1) / (3 * doubled_areas.sum(axis=1))[:, None]
+    return rims[..., 0] * after[..., 1] - rims[..., 1] * after[..., 0]
 
 
 def without_shifts(points2D: Points2D, board_points: Points2D, radius_m: float, size: tuple[int, int]) -> Points2D:

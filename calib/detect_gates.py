@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from calib.boards import Board
-from calib.detect_circles import fit_circles, with_dark_circles, without_shifts
+from calib.detect_circles import areas_by_one_lens, fit_circles, with_dark_circles, without_shifts
 from calib.detect_crossings import Expectations, fit_crossings
 from calib.detect_neighbours import Affines, local_affines, predicted_through_lens
 from calib.detect_places import LEAST_BEND, LEAST_BEND_PX, misplaced
@@ -253,15 +253,17 @@ def fitted_circles(
     nothing = np.full(len(ids), np.nan)
     corners = Corners(ids, points2D, centroids, covariances, np.full((len(ids), 11), np.nan), nothing)
     corners.reject(np.isnan(centroids[:, 0]), "cut off, or no circle")
-    if not corners.kept.any():
-        return corners
     spacing = np.linalg.svd(affines, compute_uv=False)[:, 1] * board.pitch_m
     corners.reject(np.linalg.norm(centroids - points2D, axis=1) > np.maximum(config.max_jump * spacing, 1.0), "jumped")
-    corners.reject(np.abs(areas / np.nanmedian(areas) - 1) > _ODD_AREA, "not the size of a circle")
+    size, kept = (grey.shape[1], grey.shape[0]), corners.kept
+    if kept.sum() >= 4:
+        expected = areas_by_one_lens(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2, size)
+        areas[kept] /= expected
+        odd = np.abs(areas / np.median(areas[kept]) - 1) > _ODD_AREA
+        corners.reject(kept & odd, "not the size of a circle")
     _judge_places(board, corners, config)
     kept = corners.kept
     if kept.sum() >= 4:
         corners.points2D = centroids.copy()
-        size = grey.shape[1], grey.shape[0]
         corners.points2D[kept] = without_shifts(centroids[kept], on_board(board, ids[kept]), board.detail_m / 2, size)
     return corners
