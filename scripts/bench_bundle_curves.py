@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,40 +48,11 @@ def curve_table(curves: dict[str, Curve]) -> str:
 
 
 def draw(named: Sequence[tuple[str, dict[str, Curve]]], path: Path) -> None:
-    """One panel for each problem, both axes logarithmic; with matplotlib if it is there, else with OpenCV."""
-    if not named:
-        return
-    (_draw_matplotlib if importlib.util.find_spec("matplotlib") else _draw_opencv)(named, path)
-
-
-def _draw_matplotlib(named: Sequence[tuple[str, dict[str, Curve]]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot, ticker
-
-    columns = min(len(named), 3)
-    rows = math.ceil(len(named) / columns)
-    figure, axes = pyplot.subplots(rows, columns, figsize=(5 * columns, 3.6 * rows), squeeze=False)
-    for axis in axes.flat[len(named) :]:
-        axis.set_visible(False)
-    for axis, (name, curves) in zip(axes.flat, named, strict=False):
-        for side, curve in curves.items():
-            seconds, above = np.array(excess(curve, best_of(curves))).T
-            axis.loglog(seconds, above, "o-", markersize=3, label=side, color=np.array(_COLORS[side]) / 255)
-        axis.set_title(name, fontsize=9)
-        axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-        axis.set_xlabel("seconds since the call")
-        axis.set_ylabel("cost above the least, as a part of it")
-        axis.grid(alpha=0.3)
-        axis.legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
-def _draw_opencv(named: Sequence[tuple[str, dict[str, Curve]]], path: Path) -> None:
+    """One panel for each problem, both axes logarithmic."""
     import cv2
 
+    if not named:
+        return
     panels = [_panel(name, curves) for name, curves in named]
     columns = min(len(panels), 3)
     panels += [np.full_like(panels[0], 255)] * (-len(panels) % columns)
