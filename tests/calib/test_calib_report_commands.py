@@ -35,7 +35,7 @@ def test_a_report_is_made_from_the_camera_file_and_its_photos(sfm, calibrated):
     assert "another camera" not in made.stderr
     page = (calibrated / "r.html").read_text()
     assert "0.5 m away" in page
-    assert page.count("<svg") == 8
+    assert page.count("<svg") == 9
 
 
 def test_other_photos_are_noted(calibrated):
