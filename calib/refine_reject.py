@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from calib.detect_plane import fit_plane_closely
 from calib.refine_board import shape_still_shown
 from calib.refine_copies import without_copies
 from calib.refine_fit import ROBUST, CalibrationConfig, Fit
@@ -23,6 +24,8 @@ _NOT_A_BOARD = 0.2
 order are near 0.5."""
 _MOSTLY = 0.1
 """Part of that limit which the median corner must keep if some are far off."""
+_THROUGH_LENS = 0.25
+"""Part of that limit for a board behind a lens, which fits fisheyes up to a right angle from the axis."""
 _RAYLEIGH_MEDIAN = 1.17741
 """Median length of a pair of unit normal numbers."""
 _UNNOTICED_PX = 0.1
@@ -58,13 +61,16 @@ def sort_out(
     H, errors = found.matrices, found.errors
     flat, limits = np.isfinite(errors), _NOT_A_BOARD * found.spreads
     fits = flat & (errors <= limits)
-    for v in np.flatnonzero(flat & ~fits) if config.reject else ():
-        # Single corners may be far off: most of them must fit.
-        one = observations.of_views([int(v)])
-        H[v] = fit_view_homographies(one, robust=True).matrices[0]
-        off = np.linalg.norm(transform_points(H[v], one.board[one.rows, :2]) - one.points2D, axis=1)
-        fits[v] = np.median(off) <= _MOSTLY * limits[v]
-        errors[v] = np.inf if fits[v] else errors[v]
+    for v in np.flatnonzero(flat & ~fits):
+        one, limit = observations.of_views([int(v)]), _MOSTLY * limits[v]
+        # Near a right angle from the axis nothing is flat any more: there a board must be one through a lens.
+        if _error_through_lens(one) <= _THROUGH_LENS * limits[v]:
+            fits[v] = True
+        elif config.reject:  # single corners may be far off: most of them must fit
+            H[v] = fit_view_homographies(one, robust=True).matrices[0]
+            off = np.linalg.norm(transform_points(H[v], one.board[one.rows, :2]) - one.points2D, axis=1)
+            fits[v] = np.median(off) <= limit
+            errors[v] = np.inf if fits[v] else errors[v]
     # det ∂(u, v)/∂(x, y) = det H / w³ has the sign of det H, as w is positive on what is seen.
     turns = np.linalg.det(np.where(np.isfinite(H), H, 0.0)) > 0
     alike = turns == (np.sum(turns & fits) * 2 >= np.sum(fits))
@@ -76,6 +82,14 @@ def sort_out(
         return observations, found, rejected
     kept = np.flatnonzero(fits & alike).tolist()
     return observations.of_views(kept), Homographies(H[kept], errors[kept], found.spreads[kept]), rejected
+
+
+def _error_through_lens(one: Observations) -> float:
+    """Rms of the corners of a view against a flat board behind a lens of one coefficient, px."""
+    places = one.board[one.rows, :2]
+    wanted = fit_plane_closely(places, one.points2D, (one.width, one.height)).image(places)
+    error = float(np.sqrt(np.mean(np.sum((wanted - one.points2D) ** 2, axis=1))))
+    return error if np.isfinite(error) else np.inf
 
 
 def _why_not(flat: bool, fits: bool, error: float) -> tuple[str, str]:

@@ -153,7 +153,7 @@ def _judged(
         why = found if isinstance(found, Rejected) else held
         assert isinstance(why, Rejected)
         return dataclasses.replace(row, refused=f"{why.reason}: {why.detail}")
-    if not math.isfinite(held.rms_px):
+    if not math.isfinite(held.rms_px) or held.names != best.observations.names:
         return dataclasses.replace(row, refused="a held-out view is not seen")
     return dataclasses.replace(row, held=held, rms_px=found.rms_px, camera_bound_px=_camera_bound(found))
 

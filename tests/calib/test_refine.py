@@ -488,3 +488,19 @@ def test_eight_copies_of_one_photo_are_one_photo(rng):
     why = refused([dataclasses.replace(view, name=f"{k}") for k in range(8)])
     assert why.reason == "too_few_views"
     assert why.detail.startswith("1 of 3 needed (1: copy_of 0")
+
+
+@pytest.mark.parametrize(("angle_deg", "distance"), [(30.0, 0.06), (45.0, 0.04), (60.0, 0.06)])
+def test_a_board_close_to_a_fisheye_is_a_board_though_nothing_in_its_image_is_flat(angle_deg, distance):
+    wide = Camera("OPENCV_FISHEYE", 512, 512, np.array([191.0, 191, 255, 257, 0.0033, 0.0008, -0.0021, 0.0002]))
+    angle, board = np.radians(angle_deg), flat_board()
+    ray = np.array([0.8 * np.sin(angle), 0.6 * np.sin(angle), np.cos(angle)])
+    facing = Rotation3.exp(np.array([-ray[1], ray[0], 0.0]) / np.sin(angle) * angle)
+    close = Rigid3(facing @ Rotation3.exp(np.array([0.2, -0.9, 0.3])), distance * ray)
+    rng = np.random.default_rng(0)
+    views = seen(wide, board, [*poses_before(wide, 10, rng), close], rng, 0.03)
+    for reject in (True, False):
+        found = calibrate(board, views, CalibrationConfig(lens="fisheye", reject=reject))
+        assert isinstance(found, Calibration)
+        assert not found.rejected_views
+        assert found.rms_px < 0.05
