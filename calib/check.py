@@ -94,7 +94,7 @@ def check_camera(
     Returns:
         `no_views` where none can be used, with the reason of the first.
     """
-    usable, left_out = _sorted_out(camera, views, turns)
+    usable, left_out = _sorted_out(camera, views)
     observations, _ = read_as_suits(camera, shape, gather(shape.given, usable), turns)
     system, seen = fit_poses(camera, shape, observations)
     left_out += [
@@ -130,10 +130,8 @@ def _perhaps_of_corners(finding: Finding) -> Finding:
     return dataclasses.replace(finding, remedy=f"it may be those corners; if not, {finding.remedy}")
 
 
-def _sorted_out(
-    camera: Camera, views: Sequence[BoardView], turns: Sequence[BoardTurn]
-) -> tuple[list[BoardView], list[RejectedView]]:
-    views, left_out = without_copies(views, turns)
+def _sorted_out(camera: Camera, views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
+    views, left_out = without_copies(views)
     usable = []
     for view in views:
         if (view.width, view.height) != (camera.width, camera.height):

@@ -63,10 +63,25 @@ class SeenBefore:
         return iter(sorted(found))
 
 
-def without_copies(
+def without_copies(views: Sequence[BoardView]) -> tuple[list[BoardView], list[RejectedView]]:
+    """The first of views whose corners agree to the last bit, and the others, `copy_of` it."""
+    first = dict[bytes, str]()
+    kept: list[BoardView] = []
+    copies: list[RejectedView] = []
+    for view in views:
+        key = view.corner_ids.tobytes() + view.points2D.tobytes()
+        if key in first:
+            copies.append(RejectedView(view.name, f"copy_of {first[key]}"))
+        else:
+            first[key] = view.name
+            kept.append(view)
+    return kept, copies
+
+
+def without_near_copies(
     views: Sequence[BoardView], turns: Sequence[BoardTurn] = ()
 ) -> tuple[list[BoardView], list[RejectedView]]:
-    """The first of views with the same corners, and the others.
+    """The first of photos with the same corners, and the others.
 
     These are `copy_of` it, where corners agree to the last bit, or `nearly_same_as` it.
     """

@@ -43,7 +43,7 @@ def sort_out(
 
     These are copies, of another size, or have too few corners, corners on a line or in a wrong order.
     """
-    views, rejected = without_copies(views, config.turns)
+    views, rejected = without_copies(views)
     sizes = [(view.width, view.height) for view in views]
     common = max(sorted(set(sizes), reverse=True), key=sizes.count) if sizes else (0, 0)
     usable = []

@@ -13,12 +13,13 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from calib.board_turns import board_turns
 from calib.boards import Board
 from calib.cli.corner_files import corner_files, read_corners
 from calib.cli.photos import detect_photos, detection_cache, find_photos
 from calib.detect import Detection
-from calib.refine import RejectedView
-from calib.refine_views import BoardView
+from calib.refine_copies import without_near_copies
+from calib.refine_views import BoardView, RejectedView
 from sfm.core.arrays import Points3D, Value
 from sfm.core.errors import ConfigError, Rejected
 from sfm.core.events import SILENT, Observer
@@ -83,7 +84,7 @@ def see_board(
     photos = find_photos(sources)
     cache = detection_cache() if use_cache else None
     seen = detect_photos(photos, board, threads=threads, cache=cache, observer=observer)
-    views, left_out = _sorted_out(seen, weighted=weighted)
+    views, left_out = _sorted_out(seen, board, weighted=weighted)
     return Sightings(board, board.points3D, views, (*_not_images(sources), *left_out), _digest_of(photos))
 
 
@@ -96,16 +97,17 @@ def _not_images(sources: Sequence[Path]) -> list[RejectedView]:
 
 
 def _sorted_out(
-    seen: Mapping[str, Detection | Rejected], *, weighted: bool = True
+    seen: Mapping[str, Detection | Rejected], board: Board, *, weighted: bool = True
 ) -> tuple[tuple[BoardView, ...], tuple[RejectedView, ...]]:
-    """Views of the photos that show the board, and the others with the reason."""
+    """Views of the photos that show the board, each once, and the others with the reason."""
     views, left_out = [], []
     for name, detection in seen.items():
         if isinstance(detection, Rejected):
             left_out.append(RejectedView(name, detection.reason, detection.detail))
         else:
             views.append(_view_of(detection, weighted=weighted))
-    return tuple(views), tuple(left_out)
+    views, copies = without_near_copies(views, board_turns(board))
+    return tuple(views), (*left_out, *copies)
 
 
 def _view_of(detection: Detection, *, weighted: bool = True) -> BoardView:

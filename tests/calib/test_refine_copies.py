@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib.board_turns import turn_of
-from calib.refine_copies import SeenBefore, without_copies
+from calib.refine_copies import SeenBefore, without_near_copies
 from calib.refine_views import BoardView
 from tests.calib.boards_in_space import LENS, flat_board, poses_before, seen, with_corners
 
@@ -28,7 +28,8 @@ def reasons(left_out):
 
 
 def test_a_photo_that_was_saved_anew_counts_once_and_is_named(views, rng):
-    kept, left_out = without_copies([*views, again(views[4], rng, 0.03), dataclasses.replace(views[2], name="copy")])
+    copies = [again(views[4], rng, 0.03), dataclasses.replace(views[2], name="copy")]
+    kept, left_out = without_near_copies([*views, *copies])
     assert [view.name for view in kept] == [view.name for view in views]
     assert reasons(left_out) == [("again", "nearly_same_as view04"), ("copy", "copy_of view02")]
     assert "nearly the same corners, 0.0" in left_out[0].detail
@@ -36,7 +37,7 @@ def test_a_photo_that_was_saved_anew_counts_once_and_is_named(views, rng):
 
 def test_a_copy_of_a_copy_is_told_by_the_photo_that_stays(views, rng):
     near = again(views[0], rng, 0.03)
-    _, left_out = without_copies([views[0], near, dataclasses.replace(near, name="third")])
+    _, left_out = without_near_copies([views[0], near, dataclasses.replace(near, name="third")])
     assert reasons(left_out) == [("again", "nearly_same_as view00"), ("third", "copy_of view00")]
 
 
@@ -44,7 +45,7 @@ def test_a_copy_that_lost_a_corner_or_has_a_wrong_one_is_a_copy(views, rng):
     near = again(views[0], rng, 0.03)
     fewer = BoardView("fewer", near.width, near.height, near.corner_ids[1:], near.points2D[1:])
     wrong = with_corners(dataclasses.replace(near, name="wrong"), near.points2D + 5.0 * (near.corner_ids == 7)[:, None])
-    kept, left_out = without_copies([views[0], fewer, wrong])
+    kept, left_out = without_near_copies([views[0], fewer, wrong])
     assert len(kept) == 1
     assert [view.name for view in left_out] == ["fewer", "wrong"]
 
@@ -55,8 +56,8 @@ def test_a_copy_that_was_read_from_the_other_end_is_a_copy(views, rng):
     full = next(view for view in views if len(view.corner_ids) == len(BOARD))
     near = again(full, rng, 0.03)
     turned = BoardView("turned", near.width, near.height, turn.rows, near.points2D)
-    assert len(without_copies([full, turned])[0]) == 2
-    assert len(without_copies([full, turned], (turn,))[0]) == 1
+    assert len(without_near_copies([full, turned])[0]) == 2
+    assert len(without_near_copies([full, turned], (turn,))[0]) == 1
 
 
 @pytest.mark.parametrize("step_px", [0.5, 1.0, 3.0])
@@ -64,18 +65,18 @@ def test_photos_of_slow_motion_stay(views, rng, step_px):
     frames = [
         dataclasses.replace(with_corners(views[0], views[0].points2D + [k * step_px, 0]), name=f"{k}") for k in range(9)
     ]
-    assert len(without_copies(frames)[0]) == 9
+    assert len(without_near_copies(frames)[0]) == 9
 
 
 def test_parts_of_a_board_that_share_corners_stay(views):
     one = views[0]
     half = BoardView("half", one.width, one.height, one.corner_ids[:12], one.points2D[:12])
-    assert len(without_copies([one, half])[0]) == 2
+    assert len(without_near_copies([one, half])[0]) == 2
 
 
 def test_photos_of_another_size_are_no_copies(views, rng):
     smaller = dataclasses.replace(again(views[0], rng, 0.03), width=views[0].width - 1)
-    assert len(without_copies([views[0], smaller])[0]) == 2
+    assert len(without_near_copies([views[0], smaller])[0]) == 2
 
 
 def test_what_is_found_in_cells_is_what_comparing_all_with_all_finds(rng):
