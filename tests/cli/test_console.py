@@ -122,6 +122,14 @@ def test_a_target_that_cannot_be_written_is_known_before_the_work(
     assert sorted(os.listdir()) == ["file", "model", "photos"]
 
 
+@pytest.fixture(autouse=True)
+def interruptible():
+    """Shells that start a run in the background have it ignore interruptions, and all that it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def test_of_every_command_it_is_known_what_it_writes():
     assert set(COMMANDS) == set(TARGETS) | KEEP_TO_THEIR_WORKSPACE | ONLY_READ
 
